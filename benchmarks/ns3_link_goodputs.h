@@ -111,9 +111,7 @@ inline std::vector<double> Goodputs(const Options& options)
         double rate_bit_s = WifiMode(options.mode).GetDataRate(Vector(options));
         offered_bit_s = rate_bit_s * std::min(1.1, 3.0 / options.stations);
     }
-    TypeId::AttributeInformation information;
-    bool has_tos_attribute =
-        TypeId::LookupByName("ns3::OnOffApplication").LookupAttributeByName("Tos", &information);
+    bool has_tos_attribute = HasAttribute("ns3::OnOffApplication", "Tos");
     for (uint32_t n = 0; n < options.stations; n++)
     {
         OnOffHelper source("ns3::UdpSocketFactory", targets[n % targets.size()]);

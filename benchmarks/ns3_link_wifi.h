@@ -50,6 +50,13 @@ struct Options
     std::string lost_acks;
 };
 
+// True if objects of a type have an attribute in this version of ns-3.
+inline bool HasAttribute(const std::string& type, const std::string& attribute)
+{
+    TypeId::AttributeInformation information;
+    return TypeId::LookupByName(type).LookupAttributeByName(attribute, &information);
+}
+
 inline WifiStandard StandardOf(const std::string& mode)
 {
     switch (mode[0])
@@ -91,9 +98,10 @@ inline NetDeviceContainer Install(const Options& options, NodeContainer nodes,
     phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
     phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
     // By default no RTS is sent, not even before aggregates of more than 65,535 bytes. The Block Ack window of 802.11ax
-    // has 256 MPDUs.
+    // has 256 MPDUs. Its size is an attribute of the MAC in ns-3 3.43.
     Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(options.rts));
-    Config::SetDefault("ns3::HeConfiguration::MpduBufferSize", UintegerValue(256));
+    std::string window_type = HasAttribute("ns3::WifiMac", "MpduBufferSize") ? "ns3::WifiMac" : "ns3::HeConfiguration";
+    Config::SetDefault(window_type + "::MpduBufferSize", UintegerValue(256));
     Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
     Config::SetDefault("ns3::HeConfiguration::GuardInterval", TimeValue(NanoSeconds(std::max<int>(options.guard_ns, 800))));
     WifiHelper wifi;
