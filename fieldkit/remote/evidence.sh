@@ -2,9 +2,8 @@
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-print_state() { # print the state of the host, of interface $1 and of its radio
+print_state() { # print the state of the host, of interface $1 and of the radio with interface $radio
     interface=$1
-    find_radio "$1"
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
         /proc/sys/net/ipv4/tcp_congestion_control; do
@@ -85,9 +84,8 @@ fail_to_write() { # fail with the reason why file $1 cannot be written
     fail "cannot write $1${reason:+: ${reason##*: }}"
 }
 
-write_snapshot() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
-    find_radio "$2"
-    [ -e "$1" ] || snapshot ".sources-$$" "$radio" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
+write_snapshot() { # write file $1 with a snapshot of the sources of this robot with radio $2, unless it exists
+    [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
 }
 
 begin() {
@@ -101,9 +99,10 @@ begin() {
         read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || fail_to_write .began
         sync_to_disk .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
+    find_radio "$interface"
     [ -e "$role-before.txt" ] || print_state "$interface" >"$role-before.txt" 2>&1 || fail_to_write "$role-before.txt"
-    write_snapshot "$role-sources-before.txt" "$interface"
-    start_sampler "$role" "$interface"
+    write_snapshot "$role-sources-before.txt" "$radio"
+    start_sampler "$role" "$radio"
     start_clock_sampler "$role"
     [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
@@ -114,9 +113,10 @@ pack() {
     enter "$dir"
     stop_samplers "$role"
     await_leaving_jobs
+    find_radio "$3"
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && print_job_ends && print_state "$3"; } >"$role-after.txt" 2>&1 ||
         fail_to_write "$role-after.txt"
-    write_snapshot "$role-sources-after.txt" "$3"
+    write_snapshot "$role-sources-after.txt" "$radio"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"

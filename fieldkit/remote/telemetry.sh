@@ -10,25 +10,25 @@ SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in
 BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes
 
 # Set radio to the Wi-Fi interface that carries the frames of interface $1: $1, or one below it (bat0 of batman-adv, a
-# bridge). The kernel lists the interfaces below as lower_NAME.
+# bridge).
 find_radio() {
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     radio=$1
-    [ ! -e "/sys/class/net/$1/phy80211" ] || return 0
-    for lower in "/sys/class/net/$1"/lower_*; do
-        [ ! -e "$lower/phy80211" ] || radio=${lower##*/lower_}
+    # The lines are `4: wlan0: ...` or `5: wlan0.2@wlan0: ...`.
+    for lower in $(ip -o link show master "$1" 2>/dev/null | awk '{ sub(/[:@].*/, "", $2); print $2 }'); do
+        ! timeout -s KILL "$SOURCE_S" iw dev "$lower" info >/dev/null 2>&1 || radio=$lower
     done
 }
 
-# Start a job that samples the radio of interface $2 of role $1. Do nothing without iw, or if it was started before.
+# Start a job that samples the radio with interface $2 of role $1. Do nothing without iw, or if it was started before.
 start_sampler() {
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     command -v iw >/dev/null && mkdir "$PWD/.jobs/link" 2>/dev/null || return 0
     meta=$PWD/.jobs/link shell=sh
     ! command -v bash >/dev/null || shell=bash # its `read` has a timeout
     read -r token _ <.began
-    find_radio "$2"
-    echo "sample the link of $radio" >"$meta/command"
-    detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$radio" "$token"
+    echo "sample the link of $2" >"$meta/command"
+    detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
 # Stop the jobs of the link, of the clock and of the telemetry sources of role $1; compress the files of the link and of the

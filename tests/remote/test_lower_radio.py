@@ -1,5 +1,6 @@
 """The Wi-Fi interface that a robot's sampler reads if the interface under test is above it."""
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -10,25 +11,33 @@ from tests.helpers.paths import ROOT
 pytestmark = pytest.mark.emulated
 
 TELEMETRY = ROOT / "fieldkit/remote/telemetry.sh"
-INTERFACES = ("bat0/lower_wlan1", "bat0/lower_eth0", "wlan0/lower_wlan1", "eth0", "wlan1", "br0/lower_eth0")
-RADIOS = ("wlan0", "wlan1")
+PROGRAMS = {
+    "ip": """
+case "$*" in
+    "-o link show master bat0") echo "4: eth0: <UP> mtu 1500"; echo "5: wlan1: <UP> mtu 1532 master bat0" ;;
+    "-o link show master br0") echo "6: eth1.2@eth1: <UP> mtu 1500 master br0" ;;
+    "-o link show master wlan0") ;;
+    *) echo "Device does not exist." >&2; exit 1 ;;
+esac
+""",
+    "iw": """
+case "$*" in "dev wlan"[01]" info") echo type IBSS ;; *) echo "No such device" >&2; exit 237 ;; esac
+""",
+}
+"""Substitutes of the programs; ip prints the interfaces that have a master as iproute2 does."""
 
 
 @pytest.mark.parametrize(
-    ("interface", "radio"), [("bat0", "wlan1"), ("wlan0", "wlan0"), ("eth0", "eth0"), ("br0", "br0"), ("-", "-")]
+    ("interface", "radio"), [("bat0", "wlan1"), ("br0", "br0"), ("wlan0", "wlan0"), ("eth9", "eth9")]
 )
 def test_the_radio_is_the_interface_or_the_one_below_it(interface: str, radio: str, tmp_path: Path) -> None:
-    """`tmp_path` has the layout of /sys/class/net: `lower_NAME` is a link to the folder of NAME."""
-    for path in INTERFACES:
-        name, _, lower = path.partition("/lower_")
-        (tmp_path / name).mkdir(exist_ok=True)
-        if lower:
-            (tmp_path / name / f"lower_{lower}").symlink_to(f"../{lower}")
-    for name in RADIOS:
-        (tmp_path / name / "phy80211").mkdir()
-    functions = TELEMETRY.read_text(encoding="ascii").replace("/sys/class/net", str(tmp_path))
+    for name, text in PROGRAMS.items():
+        (tmp_path / name).write_text(f"#!/bin/sh{text}", encoding="ascii")
+        (tmp_path / name).chmod(0o755)
+    functions = TELEMETRY.read_text(encoding="ascii")
     result = subprocess.run(
-        ["sh", "-c", f'{functions}\nfind_radio "$1" && echo "$radio"', "sh", interface],
+        ["sh", "-c", f'SOURCE_S=60\n{functions}\nfind_radio "$1" && echo "$radio"', "sh", interface],
+        env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
         check=True,
