@@ -105,8 +105,8 @@ def additional_repeats_by_cell(
 
     Args:
         cells: Cells with estimates of any quantities.
-        half_widths: Requested half-width by unit. Quantities with other units, and estimates without an interval, are
-            not in the result.
+        half_widths: Requested half-width by unit. Quantities with other units, and estimates without a finite number,
+            are not in the result.
     """
     more_by_cell: tuple[dict[str, int], ...] = tuple({} for _ in cells)
     quantities = {estimate.quantity for cell in cells for estimate in cell.estimates.values()}
@@ -117,7 +117,7 @@ def additional_repeats_by_cell(
         n = [estimate.n for estimate in estimates]
         more = additional_repeats(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
         for index, count in zip(indices, more.tolist(), strict=True):
-            if not math.isnan(count):
+            if math.isfinite(count):
                 more_by_cell[index][quantity.name] = int(count)
     return more_by_cell
 
@@ -140,7 +140,8 @@ def additional_repeats(
         unit: Unit of the quantity.
 
     Returns:
-        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval.
+        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval, and infinity for
+        the interval from 0 to 1 of a share, which does not show the dispersion.
 
     Raises:
         ValueError: A requested half-width is not above 0.
@@ -170,7 +171,10 @@ def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> ND
     """Return quantile²/trials of a score interval with the half-width `half`; infinity for 1/2 and more."""
     spread, square = share * (1 - share), half**2
     a, b = 0.25 - square, spread - 2 * square
-    return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)
+    root = np.sqrt(b * b + 4 * a * square)
+    # Of the two forms of the solution, each is used where it has no difference of nearly equal numbers.
+    solution = np.where(b > 0, 2 * square / (root + b), (root - b) / (2 * a))
+    return np.where(half < 0.5, solution, np.inf)
 
 
 def _with_student(
