@@ -105,8 +105,8 @@ def additional_repeats_by_cell(
 
     Args:
         cells: Cells with estimates of any quantities.
-        half_widths: Requested half-width by unit. Quantities with other units, and estimates without a finite number,
-            are not in the result.
+        half_widths: Requested half-width by unit. Quantities with other units, and estimates without an interval, are
+            not in the result.
     """
     more_by_cell: tuple[dict[str, int], ...] = tuple({} for _ in cells)
     quantities = {estimate.quantity for cell in cells for estimate in cell.estimates.values()}
@@ -117,7 +117,7 @@ def additional_repeats_by_cell(
         n = [estimate.n for estimate in estimates]
         more = additional_repeats(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
         for index, count in zip(indices, more.tolist(), strict=True):
-            if math.isfinite(count):
+            if not math.isnan(count):
                 more_by_cell[index][quantity.name] = int(count)
     return more_by_cell
 
@@ -140,8 +140,7 @@ def additional_repeats(
         unit: Unit of the quantity.
 
     Returns:
-        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval, and infinity for
-        the interval from 0 to 1 of a share, which does not show the dispersion.
+        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval.
 
     Raises:
         ValueError: A requested half-width is not above 0.

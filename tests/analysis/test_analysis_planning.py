@@ -93,11 +93,6 @@ def test_the_number_of_repeats_for_a_tiny_width_is_proportional_to_its_inverse_s
     assert billionth == pytest.approx(thousandth * 1e12, rel=1e-3)
 
 
-def test_an_interval_of_all_shares_shows_no_dispersion() -> None:
-    everything = Intervals(*np.array([[0.5], [0.0], [1.0]]))
-    assert np.isinf(sample_size.additional_repeats(everything, 2, 0.1, Kind.MEAN)).all()
-
-
 def test_a_single_repeat_gives_no_number_of_repeats() -> None:
     assert np.isnan(sample_size.additional_repeats(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
 

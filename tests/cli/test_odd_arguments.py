@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.core import files
 from tests.helpers.runs import run_here
-from tests.helpers.tables import COMPARABLE, replace, write
+from tests.helpers.tables import COMPARABLE, repeats, replace, write
 
 
 @pytest.mark.parametrize(
@@ -40,6 +40,13 @@ def test_options_may_be_between_words(tmp_path: Path) -> None:
     assert "unknown unit 'kg'" in run_here(tmp_path, "trial", "los", "30ft", "--dry-run", "40kg").err
     unknown = run_here(tmp_path, "aggregate", "a", "--by", "trial", "b", "--bye", "x")
     assert "no option or argument '--bye'" in unknown.err
+
+
+def test_a_tiny_width_has_a_finite_number_of_repeats(tmp_path: Path) -> None:
+    write(tmp_path / "a", repeats(COMPARABLE, 8))
+    run = run_here(tmp_path, "aggregate", "a", "--width", "0.0000000001%", "--quantity", "ip_loss", "--format", "csv")
+    assert run.code == 0, run.err
+    assert 1e15 < int(run.out.splitlines()[1].rpartition(",")[2]) < 1e25
 
 
 def test_an_error_of_a_trial_is_not_an_error_of_the_written_file(tmp_path: Path) -> None:
