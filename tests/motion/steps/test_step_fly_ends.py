@@ -31,7 +31,7 @@ from sim_backends.emulated.autopilot.px4 import PX4
 from tests.agent.test_link_server import servers
 from tests.helpers import drones
 from tests.helpers.casts import DUCKIEDRONE
-from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.host import descendants, process_file, wait_for_end
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.nightly import mark_nightly
@@ -117,8 +117,7 @@ def test_takeover_by_a_person_aborts_the_nested_steps(shell: Shell) -> None:
 def agent_of(shell: Shell, job: str) -> int:
     """Return the process id of the agent of a job."""
     leader = int((shell.home / FOLDER / f".jobs/{job}/pid").read_text(encoding="ascii").split()[0])
-    names = {pid: Path(f"/proc/{pid}/comm").read_text(encoding="utf-8") for pid in descendants(leader)}
-    (pid,) = (pid for pid, name in names.items() if name.startswith("python"))
+    (pid,) = (pid for pid in descendants(leader) if process_file(pid, "comm").startswith(b"python"))
     return pid
 
 

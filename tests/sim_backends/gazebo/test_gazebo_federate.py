@@ -33,7 +33,7 @@ from sim_backends.physics.robot_limits import QuadrotorLimits
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import GazeboServer, gazebo_server, missing_libraries
-from tests.helpers.host import descendants
+from tests.helpers.host import descendants, process_file
 
 pytestmark = [pytest.mark.emulated, pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())]
 
@@ -293,9 +293,7 @@ def test_the_next_run_restores_the_models_of_a_killed_run(tmp_path: Path, capfd:
 def adapter_pid() -> int:
     """Return the process of the adapter, which is a child of this process."""
     pids = [
-        pid
-        for pid in descendants(os.getpid())
-        if b"gazebo-adapter" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]
+        pid for pid in descendants(os.getpid()) if b"gazebo-adapter" in process_file(pid, "cmdline").split(b"\0")[0]
     ]
     assert len(pids) == 1
     return pids[0]
