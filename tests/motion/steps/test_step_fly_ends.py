@@ -41,7 +41,7 @@ from tests.helpers.userlands import LocalShell
 pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "tcp-01-1")
-FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s, lease: 3s"
+FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s"
 DETECTION_LIMIT_S = 5.0
 """Maximum time until the loss is detected on a busy machine; a quiet machine needs less than 1 s."""
 NEAR_M = 0.6
@@ -72,7 +72,13 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def fly(
-    shell: Shell, url: int | str, wait_duration: str, on_wait: Callable[[], object], abort: OnAbort = OnAbort.LAND
+    shell: Shell,
+    url: int | str,
+    wait_duration: str,
+    on_wait: Callable[[], object],
+    abort: OnAbort = OnAbort.LAND,
+    *,
+    lease: str = "30s",
 ) -> None:
     """Fly a drone at a UDP port or a connection. `on_wait` is called when a nested step starts."""
     connection = url if isinstance(url, str) else f"udpout:127.0.0.1:{url}"
@@ -88,7 +94,8 @@ def fly(
     scene = Scene(
         Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, sections={ON_ABORT: AbortActions({Role.RECEIVER: abort})}
     )
-    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {wait_duration}}}}}, {{wait: {{duration: {wait_duration}}}}}]}}"
+    wait = f"{{wait: {{duration: {wait_duration}}}}}"
+    step = f"{{{FLIGHT}, lease: {lease}, during: [{wait}, {wait}]}}"
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
@@ -297,7 +304,7 @@ def test_arducopter_returns_after_its_lease_has_expired(shell: Shell) -> None:
             shell.is_interrupted = True
 
         with pytest.raises(LinkError, match="out of range"):
-            fly(shell, port, "1ms", interrupt_link, OnAbort.RETURN)
+            fly(shell, port, "1ms", interrupt_link, OnAbort.RETURN, lease="3s")
         wait_until(lambda: not vehicle.is_armed, Deadline.after(60))
         assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "the drone is at the take-off point"
         shell.is_interrupted = False
