@@ -150,7 +150,7 @@ def test_the_clock_may_arrive_after_the_poses_of_its_step(tmp_path: Path) -> Non
 
 
 def test_lost_commands_are_sent_again(tmp_path: Path) -> None:
-    states = []
+    states: list[dict[str, State]] = []
     for fault in ((), ("--fault", "lost-commands@0.3545")):
         (folder := tmp_path / str(len(states))).mkdir()
         with gazebo_server(folder, SDF, *fault) as gazebo, open_federate(gazebo) as physics:
