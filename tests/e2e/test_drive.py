@@ -64,7 +64,9 @@ SPEED_M_S = 0.6
 LEASE_S = 2.0
 """Lease of the tests in which it expires."""
 LONG_LEASE_S = 30.0
-"""Lease of the other tests, so that a busy machine does not stop a robot. An order stops it in half of this time."""
+"""Lease of the other tests, so that a busy machine does not stop a robot."""
+ORDER_S = 6.0
+"""Time limit for an order to stop a robot. On an idle machine it takes some tenths of a second (`benchmarks.stop`)."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = texts.procedure(
     "drive",
@@ -298,7 +300,7 @@ def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots,
         process.send_signal(number)
         stopped_after_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
-    assert stopped_after_s < LONG_LEASE_S / 2, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     assert "stopping: rover-1 stops where it is" in run.err
     assert "rover-1: stopped (stationary)" in run.err
     assert run.code == 130
@@ -347,7 +349,7 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRob
         process.wait()
         reader.join()
         os.close(master)
-    assert stopped_after_s < LONG_LEASE_S / 2, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     text = b"".join(output_parts).decode()
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
@@ -369,7 +371,7 @@ def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) 
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
-    assert stopped_after_s < LONG_LEASE_S / 2, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     assert run.code == 130
     assert math.dist(place_m(field_robots), home_m) > 0.3, "it has not reached its home"
     assert_held(field_robots, "stopped by the operator")
