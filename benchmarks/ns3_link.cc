@@ -12,24 +12,7 @@
 #include "ns3_link_streams.h"
 #include "ns3_link_wifi.h"
 
-#include <map>
-
 namespace fieldkit {
-
-WifiTxVector Vector(const Options& options)
-{
-    const std::map<WifiStandard, WifiPreamble> preambles{{WIFI_STANDARD_80211n, WIFI_PREAMBLE_HT_MF},
-                                                         {WIFI_STANDARD_80211ac, WIFI_PREAMBLE_VHT_SU},
-                                                         {WIFI_STANDARD_80211ax, WIFI_PREAMBLE_HE_SU}};
-    auto preamble = preambles.find(StandardOf(options.mode));
-    WifiTxVector vector;
-    vector.SetMode(WifiMode(options.mode));
-    vector.SetChannelWidth(options.width);
-    vector.SetNss(options.streams);
-    vector.SetGuardInterval(options.guard_ns);
-    vector.SetPreambleType(preamble == preambles.end() ? WIFI_PREAMBLE_LONG : preamble->second);
-    return vector;
-}
 
 void Durations(const Options& options)
 {

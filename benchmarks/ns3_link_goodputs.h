@@ -36,6 +36,18 @@ inline std::vector<double> RunAndMeasure(const std::vector<Ptr<PacketSink>>& sin
     return bits;
 }
 
+// Set the traffic class of packets to an address in ns-3 before 3.43; later versions have an attribute of applications.
+template <typename Address>
+auto SetTos(Address& to, uint8_t tos, int) -> decltype(to.SetTos(tos))
+{
+    to.SetTos(tos);
+}
+
+template <typename Address>
+void SetTos(Address&, uint8_t, long)
+{
+}
+
 // Goodput in Mbit/s of the stations of each traffic class.
 inline std::vector<double> Goodputs(const Options& options)
 {
@@ -86,7 +98,7 @@ inline std::vector<double> Goodputs(const Options& options)
     for (std::size_t number = 0; number < classes.size(); number++)
     {
         InetSocketAddress to(interfaces.GetAddress(options.stations), 9 + number);
-        to.SetTos(classes[number]);
+        SetTos(to, classes[number], 0);
         PacketSinkHelper sink("ns3::UdpSocketFactory", to);
         sinks.push_back(DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0)));
         targets.push_back(to);
@@ -96,12 +108,17 @@ inline std::vector<double> Goodputs(const Options& options)
     uint64_t offered_bit_s = 70000000;
     if (options.ampdu)
     {
-        double rate_bit_s = WifiMode(options.mode).GetDataRate(options.width, options.guard_ns, options.streams);
+        double rate_bit_s = WifiMode(options.mode).GetDataRate(Vector(options));
         offered_bit_s = rate_bit_s * std::min(1.1, 3.0 / options.stations);
     }
+    bool has_tos_attribute = HasAttribute("ns3::OnOffApplication", "Tos");
     for (uint32_t n = 0; n < options.stations; n++)
     {
         OnOffHelper source("ns3::UdpSocketFactory", targets[n % targets.size()]);
+        if (has_tos_attribute)
+        {
+            source.SetAttribute("Tos", UintegerValue(classes[n % classes.size()]));
+        }
         source.SetConstantRate(DataRate(offered_bit_s), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
     }

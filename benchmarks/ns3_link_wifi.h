@@ -9,6 +9,9 @@
 #include "ns3/propagation-module.h"
 #include "ns3/wifi-module.h"
 
+#include <map>
+#include <type_traits>
+
 namespace fieldkit {
 
 using namespace ns3;
@@ -46,6 +49,13 @@ struct Options
     std::string lost_data;
     std::string lost_acks;
 };
+
+// True if objects of a type have an attribute in this version of ns-3.
+inline bool HasAttribute(const std::string& type, const std::string& attribute)
+{
+    TypeId::AttributeInformation information;
+    return TypeId::LookupByName(type).LookupAttributeByName(attribute, &information);
+}
 
 inline WifiStandard StandardOf(const std::string& mode)
 {
@@ -88,9 +98,10 @@ inline NetDeviceContainer Install(const Options& options, NodeContainer nodes,
     phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
     phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
     // By default no RTS is sent, not even before aggregates of more than 65,535 bytes. The Block Ack window of 802.11ax
-    // has 256 MPDUs.
+    // has 256 MPDUs. Its size is an attribute of the MAC in ns-3 3.43.
     Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(options.rts));
-    Config::SetDefault("ns3::HeConfiguration::MpduBufferSize", UintegerValue(256));
+    std::string window_type = HasAttribute("ns3::WifiMac", "MpduBufferSize") ? "ns3::WifiMac" : "ns3::HeConfiguration";
+    Config::SetDefault(window_type + "::MpduBufferSize", UintegerValue(256));
     Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
     Config::SetDefault("ns3::HeConfiguration::GuardInterval", TimeValue(NanoSeconds(std::max<int>(options.guard_ns, 800))));
     WifiHelper wifi;
@@ -127,6 +138,36 @@ inline NetDeviceContainer Install(const Options& options, NodeContainer nodes,
                     "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
     devices.Add(wifi.Install(phy, mac, nodes.Get(nodes.GetN() - 1)));
     return devices;
+}
+
+// A guard interval is a number of nanoseconds in ns-3 3.37, and a Time in 3.43.
+template <typename Interval>
+void SetGuardInterval(WifiTxVector& vector, void (WifiTxVector::*set)(Interval), uint16_t guard_ns)
+{
+    if constexpr (std::is_same_v<Interval, Time>)
+    {
+        (vector.*set)(NanoSeconds(guard_ns));
+    }
+    else
+    {
+        (vector.*set)(guard_ns);
+    }
+}
+
+// Settings of a transmission.
+inline WifiTxVector Vector(const Options& options)
+{
+    const std::map<WifiStandard, WifiPreamble> preambles{{WIFI_STANDARD_80211n, WIFI_PREAMBLE_HT_MF},
+                                                         {WIFI_STANDARD_80211ac, WIFI_PREAMBLE_VHT_SU},
+                                                         {WIFI_STANDARD_80211ax, WIFI_PREAMBLE_HE_SU}};
+    auto preamble = preambles.find(StandardOf(options.mode));
+    WifiTxVector vector;
+    vector.SetMode(WifiMode(options.mode));
+    vector.SetChannelWidth(options.width);
+    vector.SetNss(options.streams);
+    SetGuardInterval(vector, &WifiTxVector::SetGuardInterval, options.guard_ns);
+    vector.SetPreambleType(preamble == preambles.end() ? WIFI_PREAMBLE_LONG : preamble->second);
+    return vector;
 }
 
 } // namespace fieldkit
