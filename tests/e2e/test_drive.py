@@ -66,7 +66,7 @@ LEASE_S = 2.0
 LONG_LEASE_S = 30.0
 """Lease of the other tests, so that a busy machine does not stop a robot."""
 ORDER_S = 6.0
-"""Time limit for an order to stop a robot. On an idle machine it takes some tenths of a second (`benchmarks.stop`)."""
+"""Time limit for an order to stop a robot. An idle machine needs some tenths of a second (`benchmarks.stop`)."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = texts.procedure(
     "drive",
