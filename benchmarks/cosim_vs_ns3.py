@@ -6,8 +6,8 @@ is measured; TCP sends at full rate. The loss of the wall is computed here, and 
 
 There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension (ns-3
 models it wrongly); and 802.11a with a corrected TCP, because ns-3's TCP deviates from the standards at the edge of
-a link's range (`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the
-ratio. `--links g54` runs only the links with this text in their names.
+a link's range (`ns3_link_streams.h` lists the corrections). Each link is run with enough seeds for a narrow interval
+of the ratio. `--links g54` runs only the links with this text in their names.
 """
 
 import argparse

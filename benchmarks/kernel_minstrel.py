@@ -7,7 +7,6 @@ kernel selected (stages `rate:tries:flags`), and the number of tries, with `+` i
 """
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
+from benchmarks.experiment_packets import PacketSender, interface_address
 from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RATE_MCS,
     RATE_SHORT_GUARD_INTERVAL,
@@ -31,9 +31,6 @@ from sim_backends.emulated.linux_wifi.radios import HwsimRadio, find_radios
 
 MAX_TRIES: Final = 7  # of a frame
 SIGNAL_DBM: Final = -50
-_PRIORITY: Final = 0x107
-"""Access category VO, which has no block-ACK session: in a session minstrel_ht ignores the reports of hwsim."""
-_ETHERTYPE: Final = 0x88B5  # for experiments: IEEE 802
 _DATA: Final = 0x08  # type of data frames in the field frame control
 _JOIN_S: Final = 60.0  # time limit for joining the cell
 _POLL_S: Final = 0.5  # interval between checks whether the radios have joined
@@ -106,14 +103,14 @@ class Cell:
         self._kernel.send(status)
 
 
-def record(trace: dict[str, Any], cell: Cell, link: socket.socket, packet: bytes) -> None:
-    """Send the frames of the trace and print the rates that the kernel selected."""
+def record(trace: dict[str, Any], cell: Cell, sender: PacketSender, receiver: bytes) -> None:
+    """Send the frames of the trace to an address, and print the rates that the kernel selected."""
     start_ns = time.monotonic_ns()
     for number in range(len(trace["levels"])):
         while time.monotonic_ns() < start_ns + number * trace["step_ns"]:
             cell.poll()
             time.sleep(_IDLE_S)
-        link.send(packet)
+        sender.send(receiver, trace["payload_bytes"])
         while (frame := cell.poll()) is None:
             pass
         time_us = (time.monotonic_ns() - start_ns) // 1000
@@ -140,15 +137,9 @@ def main() -> None:
         until_s = time.monotonic() + _POLL_S
         while time.monotonic() < until_s:
             cell.poll()
-    addresses = [
-        bytes.fromhex(Path(f"/sys/class/net/{radio.interface}/address").read_text().strip().replace(":", ""))
-        for radio in radios
-    ]
-    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as link:
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_PRIORITY, _PRIORITY)
-        link.bind((radios[0].interface, 0))
-        payload = bytes(trace["payload_bytes"])
-        record(trace, cell, link, addresses[1] + addresses[0] + _ETHERTYPE.to_bytes(2, "big") + payload)
+    sender = PacketSender(radios[0].interface)
+    record(trace, cell, sender, interface_address(radios[1].interface))
+    sender.close()
     kernel.close()
 
 

@@ -8,10 +8,8 @@ ratio of the frame; both algorithms use the same random draws. The kernel's choi
 """
 
 import argparse
-import gzip
 import json
 import math
-import shlex
 import sys
 import tempfile
 from collections import Counter
@@ -24,19 +22,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from benchmarks import kernel_recordings
 from benchmarks.kernel_minstrel import MAX_TRIES, is_received, mode_name
-from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.hwsim_messages import RateStage
-from sim_backends.emulated.linux_wifi.virtual_machine import require_machine, run_in_machine
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import PhyCapability, format_modes, mode_groups
 from sim_backends.radio.phy.modes import WifiMode, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
 
-ROOT: Final = Path(__file__).resolve().parent.parent
-RECORDINGS: Final = ROOT / "tests/data/hwsim/6.1.176"
 TRACES: Final = {"walk": False, "walk with fading": True}
 """Traces by name; True if the trace has fading."""
 SEEDS: Final = 20
@@ -118,21 +112,16 @@ def trace(frames: int, *, fading: bool) -> dict[str, Any]:
 
 def recording(name: str) -> Path:
     """Return the file of the recording of a trace."""
-    return RECORDINGS / f"minstrel-{name.replace(' ', '-')}.csv.gz"
+    return kernel_recordings.RECORDINGS / f"minstrel-{name.replace(' ', '-')}.csv.gz"
 
 
 def record(content: dict[str, Any]) -> str:
     """Return the recording of a trace in a new virtual machine."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "trace").write_text(json.dumps(content), encoding="ascii")
-        files = [shlex.quote(str(folder / file)) for file in ("trace", "recording")]
-        python = shlex.join((sys.executable, "-m", "benchmarks.kernel_minstrel"))
-        script = f"{guest.prologue(ROOT)}{python} {files[0]} >{files[1]}\n"
-        result = run_in_machine(require_machine(), script, Deadline.after(_LONGEST_S), radios=2, results=folder)
-        if result.code:
-            sys.exit(result.output)
-        return (folder / "recording").read_text(encoding="ascii")
+        file = folder / "trace"
+        file.write_text(json.dumps(content), encoding="ascii")
+        return kernel_recordings.record(folder, "kernel_minstrel", str(file), radios=2, limit_s=_LONGEST_S)
 
 
 def read(text: str) -> list[tuple[int, tuple[RateStage, ...], int, bool]]:
@@ -257,8 +246,8 @@ def main() -> None:
     for name, fading in TRACES.items():
         content = trace(FRAMES, fading=fading)
         if options.record:
-            recording(name).write_bytes(gzip.compress(record(content).encode(), mtime=0))
-        kernel = kernel_frames(gzip.decompress(recording(name).read_bytes()).decode())
+            kernel_recordings.save(recording(name), record(content))
+        kernel = kernel_frames(kernel_recordings.load(recording(name)))
         times_ns = [frame.time_ns for frame in kernel]
         fieldkit_runs = [fieldkit_frames(content, times_ns, seed) for seed in range(SEEDS)]
         results[name] = kernel, fieldkit_runs[0]

@@ -71,9 +71,9 @@ PEERS: Final = {"ns-3": "ns3::{}", "corrected": "Counting{}", "no clamp": "Count
 """Patterns of the class names of congestion controls: of ns-3, of the corrected variant, and of the corrected variant
 without CUBIC's clamp.
 
-The corrected variant does not count data again when it is acknowledged after a SACK; `ns3_link.cc` explains this.
-With the clamp the window grows after a timeout by at least one segment per 20 acknowledged segments. Without the
-clamp it grows by at least one per 255 segments, the largest value that can be set.
+The corrected variant does not count data again when it is acknowledged after a SACK; `ns3_link_streams.h` explains
+this. With the clamp the window grows after a timeout by at least one segment per 20 acknowledged segments. Without
+the clamp it grows by at least one per 255 segments, the largest value that can be set.
 """
 
 

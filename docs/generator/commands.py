@@ -1,6 +1,7 @@
 """The page of all commands, from the argument parser."""
 
 import argparse
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -11,6 +12,9 @@ from fieldkit.cli.commands import COMMANDS
 from fieldkit.cli.parser import Parser
 
 _WIDTH: Final = 100
+_UNLIMITED_WIDTH: Final = 10_000
+_ARGUMENT: Final = re.compile(r"\(.*?\)+(?=\s|$)|\[.*?\]+(?=\s|$)|\S+")
+"""An argument in a usage; those in brackets contain spaces. It is argparse's expression of Python 3.11."""
 DOCS: Final = Path(__file__).resolve().parents[1]
 
 GUIDES: Final = {
@@ -115,9 +119,19 @@ def _command(parser: Parser, summary: str = "") -> Iterator[str]:
 
 
 def _usage(parser: Parser) -> str:
-    formatter = argparse.HelpFormatter(parser.prog, width=_WIDTH)
+    """Return the usage in lines of at most `_WIDTH` characters, wrapped only outside of brackets.
+
+    argparse wraps the alternatives of a group in Python 3.13, but not in 3.11, so it gets an unlimited width.
+    """
+    formatter = argparse.HelpFormatter(parser.prog, width=_UNLIMITED_WIDTH)
     formatter.add_usage(parser.usage, parser._actions, parser._mutually_exclusive_groups, prefix="")  # noqa: SLF001
-    return formatter.format_help().strip()
+    arguments = formatter.format_help().strip().removeprefix(parser.prog)
+    lines = [parser.prog]
+    for argument in _ARGUMENT.findall(arguments):
+        if len(lines[-1]) + len(argument) >= _WIDTH:
+            lines.append(" " * len(parser.prog))
+        lines[-1] += f" {argument}"
+    return "\n".join(lines)
 
 
 def _is_listed(action: argparse.Action) -> bool:

@@ -104,15 +104,16 @@ def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: h
         _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
-        # The program that reads the output has exited, so an error message would not be read. Python writes the rest
-        # of the buffer when it exits. Without this redirection the write would fail and change the exit code.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The program that reads the output has exited, so an error message would not be read.
+        _discard_output()
         sys.stderr.close()
         return 0
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.
         remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "remove the cause"
         location = error.filename or "its output"
+        if error.filename is None:
+            _discard_output()
         _show_error(
             f"{location}: {error.strerror}\n"
             f"  remedy: {remedy}, then run the command again; finished repeats are saved"
@@ -124,6 +125,14 @@ def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: h
     except KeyboardInterrupt:
         _show_error("interrupted; finished repeats are saved")
         return INTERRUPTED
+
+
+def _discard_output() -> None:
+    """Redirect the standard output, which cannot be written, to /dev/null.
+
+    Python writes the rest of the buffer when it exits. That would fail again and change the exit code.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _run(arguments: argparse.Namespace) -> int:

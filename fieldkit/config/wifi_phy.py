@@ -27,7 +27,7 @@ _GUARD_INTERVALS_NS: Final[dict[WifiAmendment, tuple[int, ...]]] = {
 _MODELLED_WIDTHS_MHZ: Final = (20, 40, 80)
 
 _AMSDU_BYTES: Final = (3839, 7935, 11454)
-"""Maximum sizes: IEEE 802.11-2020, table 9-34. The last one is the size of the frame with the A-MSDU."""
+"""Maximum sizes: IEEE 802.11-2020, table 9-25. The last one is the size of the frame with the A-MSDU."""
 
 
 class WifiPhy(Strict):

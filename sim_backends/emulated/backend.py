@@ -9,29 +9,25 @@ from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS, Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of, profiles_of
-from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site, load_site
-from fieldkit.core.errors import ConfigurationError, FieldkitError, did_you_mean
+from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated import lab_checks
+from sim_backends.emulated.emulated_options import RosChoice, load_options
 from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.motion_sections import DRIVE, MAVLINK, drive_of, mavlink_of
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
-    LAPTOP_NAME,
     NETWORK,
     RobotKey,
     drives_by_topic,
     link_addresses,
     profile_in_lab,
-    sensors_of,
 )
-from sim_backends.emulated.robot.spec import unsupported_paths
-from sim_backends.emulated.ros import sensor_specs
 from sim_backends.world.world import load_world
 
 if TYPE_CHECKING:
@@ -74,38 +70,7 @@ class EmulatedBackend:
         with document.locating_errors("emulated", "world") if document else nullcontext():
             self._world = load_world(self._options.world)
         hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
-        if len(site.robots) > len(hosts):
-            raise ConfigurationError(
-                f"the lab has {len(site.robots)} robots, but an emulated lab has addresses for {len(hosts)}",
-                where=document.where(("robots",)) if document else "",
-                remedy="split the site file",
-            )
-        for name in self._options.robots:
-            if name not in site.robots:
-                raise ConfigurationError(
-                    f"emulated.robots names {name!r}, which the lab does not have",
-                    where=document.where(("emulated", "robots", name)) if document else "",
-                    remedy=did_you_mean(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
-                )
-        router = self._options.ros2.router
-        if router is not None and router not in site.robots:
-            raise ConfigurationError(
-                f"emulated.ros2.router names {router!r}, which the lab does not have",
-                where=document.where(("emulated", "ros2", "router")) if document else "",
-                remedy=did_you_mean(router, site.robots, f"the robots are: {', '.join(site.robots)}"),
-            )
-        if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
-            raise ConfigurationError(
-                f"with control: radio, the name {LAPTOP_NAME!r} is reserved for the operator's laptop",
-                where=document.where(("robots", LAPTOP_NAME)) if document else "",
-                remedy="give the robot another name",
-            )
-        if site.control is Control.RADIO and self._options.has_linux_wifi:
-            raise ConfigurationError(
-                "with `wifi: linux`, the operator's laptop has no radio",
-                where=document.where(("control",)) if document else "",
-                remedy="remove control: radio",
-            )
+        lab_checks.check_site(site, document, self._options, len(hosts))
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     @property
@@ -167,8 +132,8 @@ class EmulatedBackend:
     def cast(self, topology: Topology) -> Cast:
         """Implement `Backend.cast`; robots get addresses in their order in the site file."""
         cast = cast_of(self._site, self._document, topology, self._addresses, self._link_addresses(topology))
-        self._check_profiles(cast)
-        self._check_infrastructure((robot.name for robot in cast.values()), has_relay=topology is Topology.MASTER)
+        names = (robot.name for robot in cast.values())
+        self._check_robots(cast, names, has_relay=topology is Topology.MASTER)
         return {
             role: robot.model_copy(
                 update={
@@ -217,7 +182,7 @@ class EmulatedBackend:
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
         ros = self._find_ros(robot.name for robot in cast.values())
-        _check_bridges(cast, ros)
+        lab_checks.check_bridges(cast, ros)
         if any(robot.ros_master for robot in cast.values()):
             requirements.check_shared_master(ros)
         self._note_simulators(sink)
@@ -257,7 +222,7 @@ class EmulatedBackend:
                 yield lab
             return
         ros = self._find_ros(members)
-        _check_bridges(members, ros)
+        lab_checks.check_bridges(members, ros)
         self._note_simulators(sink)
         sink(PhaseStarted("start robots"))
         with interactive_lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as lab:
@@ -297,31 +262,18 @@ class EmulatedBackend:
                 remedy="fieldkit lab up --robots 2",
             )
         members = interactive_lab.members_of(self._site, self._document, self._addresses)
-        self._check_profiles(members)
-        self._check_infrastructure(members, has_relay=False)
+        self._check_robots(members, members, has_relay=False)
         return {
             name: replace(robot, profile=profile_in_lab(robot.profile, self._options))
             for name, robot in members.items()
         }
 
-    def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
-        """Raise ConfigurationError if the access points or neighbours in the options conflict with the robots."""
-        if not self._options.radio.has_infrastructure:
-            return
-        from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (only some labs use it)
-
-        if problem := infrastructure.conflict(self._options.radio, [*names], has_relay=has_relay):
-            raise ConfigurationError(
-                problem,
-                where=self._document.where(("emulated", "radio")) if self._document else "",
-                remedy="change emulated.radio in the site file",
-            )
-
-    def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
-        for robot in robots.values():
-            _check_ros(robot, self._options)
-            for sensor in sensors_of(robot):
-                sensor_specs.check(sensor)
+    def _check_robots(
+        self, robots: "Mapping[RobotKey, Robot | LabRobot]", names: Iterable[str], *, has_relay: bool
+    ) -> None:
+        """Raise ConfigurationError if the lab does not support the profiles, or the names of the robots."""
+        lab_checks.check_profiles(robots, self._options)
+        lab_checks.check_infrastructure(names, self._options, self._document, has_relay=has_relay)
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
@@ -342,61 +294,3 @@ class EmulatedBackend:
         if self._options.has_batman:
             requirements.check_batman()
         return requirements.ros_in_use(self._options.ros)
-
-
-def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
-    """Raise ConfigurationError if the lab does not support the ROS settings of a profile."""
-    ros = robot.profile.ros
-    if ros is None:
-        return
-    if ros.variant == "ros2":
-        _check_ros2(robot.name, ros, options.ros2)
-    if ros.variant == "ros2" and options.ros is RosChoice.DEBIAN:
-        raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, but the site file requests Debian's ROS, which is ROS 1",
-            where=robot.name,
-            remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
-        )
-    if ros.variant == "ros2" and any(topic.definition for topic in ros.topics):
-        raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only standard types",
-            where=robot.name,
-            remedy="remove the topics that have a definition from a copy of the profile",
-        )
-    if unsupported := unsupported_paths(ros.command.setup):
-        raise ConfigurationError(
-            f"a robot cannot have the setup file {unsupported[0]}: it is in the root directory or in a kernel folder",
-            where=robot.name,
-            remedy="move it to another folder",
-        )
-
-
-def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice) -> None:
-    """Raise ConfigurationError if a profile has a bridge from ROS 1 but the lab has no ROS master."""
-    for robot in robots.values():
-        if ros is RosChoice.BUILTIN and robot.profile.ros is not None and robot.profile.ros.bridge is not None:
-            raise ConfigurationError(
-                f"profile {robot.profile.name} has a bridge, which needs Debian's ROS",
-                where=robot.name,
-                remedy="apt-get install --no-install-recommends python3-rosmaster python3-rospy python3-rosbag "
-                "python3-sensor-msgs; or remove bridge from a copy of the profile",
-            )
-
-
-def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
-    """Raise ConfigurationError if the lab does not support the ROS 2 settings of a profile."""
-    from fieldkit.ros.middlewares.ports import MAX_DOMAIN  # noqa: PLC0415 (other robots need no package for ROS)
-
-    if options.discovery == "router" and ros.middleware != "zenoh":
-        raise ConfigurationError(
-            "emulated.ros2 has a router, but the profile uses DDS, which has no router",
-            where=name,
-            remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
-        )
-    if ros.domain > MAX_DOMAIN:
-        raise ConfigurationError(
-            f"the ports of ROS_DOMAIN_ID {ros.domain} of the profile are ephemeral ports of Linux, which any program "
-            "may use",
-            where=name,
-            remedy=f"use a domain from 0 to {MAX_DOMAIN}",
-        )

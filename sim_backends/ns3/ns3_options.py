@@ -1,4 +1,4 @@
-"""Options of ns-3: `network.options` of a scenario. `network.cc` reads them."""
+"""Options of ns-3: `network.options` of a scenario. `configuration.h` reads them."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping

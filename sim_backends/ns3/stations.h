@@ -127,6 +127,19 @@ struct Station
     Ipv4Address address;
 };
 
+inline size_t
+StationNamed(const std::vector<Station>& stations, const std::string& name)
+{
+    for (size_t number = 0; number < stations.size(); number++)
+    {
+        if (stations[number].name == name)
+        {
+            return number;
+        }
+    }
+    throw Refusal("there is no station " + name);
+}
+
 struct WifiSetup
 {
     std::string standard = "802.11n";

@@ -17,7 +17,7 @@ _LOSS_FACTOR: Final = 17.98
 class Solid:
     """A homogeneous material with plane faces.
 
-    Permittivity is `a f^b`, conductivity `c f^d` in S/m, with f in GHz: ITU-R P.2040-1, eqs. 28 and 29, table 3.
+    Permittivity is `a f^b`, conductivity `c f^d` in S/m, with f in GHz: ITU-R P.2040-1, table 3.
 
     Attributes:
         a: Relative permittivity at 1 GHz.
@@ -37,7 +37,7 @@ class Solid:
         return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
 
     def loss_db_per_m(self, frequency_hz: float) -> float:
-        """Return the attenuation of a plane wave in the material, in dB/m (ITU-R P.2040-1, eqs. 22 to 24)."""
+        """Return the attenuation of a plane wave in the material, in dB/m (ITU-R P.2040-1, attenuation rate)."""
         wave_number = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S
         return -_DB_PER_NEPER * wave_number * cmath.sqrt(self.permittivity(frequency_hz)).imag
 

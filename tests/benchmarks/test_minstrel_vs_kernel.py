@@ -1,12 +1,12 @@
 """The minstrel_ht of fieldkit compared with recordings of minstrel_ht in Linux, on the same frames."""
 
-import gzip
 from collections import Counter
 from statistics import correlation
 from typing import Any
 
 import pytest
 
+from benchmarks import kernel_recordings
 from benchmarks import minstrel_vs_kernel as study
 from benchmarks.kernel_minstrel import tries_of
 from benchmarks.minstrel_vs_kernel import SelectedFrame
@@ -21,7 +21,7 @@ SEEDS = range(2)
 def case(request: pytest.FixtureRequest) -> tuple[dict[str, Any], str]:
     """Return a trace, and the recording of the kernel with this trace."""
     name = str(request.param)
-    text = gzip.decompress(study.recording(name).read_bytes()).decode()
+    text = kernel_recordings.load(study.recording(name))
     return study.trace(study.FRAMES, fading=study.TRACES[name]), text
 
 

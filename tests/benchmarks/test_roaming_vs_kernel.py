@@ -1,14 +1,15 @@
 """Scans, associations, roaming and power save of fieldkit compared with recordings of Linux."""
 
-import gzip
 from collections.abc import Callable
 from statistics import fmean, median
 
 import pytest
 
+from benchmarks import kernel_recordings, roaming_lab
 from benchmarks import kernel_roaming as kernel
+from benchmarks import roaming_recordings as recordings
 from benchmarks import roaming_vs_kernel as study
-from benchmarks.roaming_vs_kernel import Recording
+from benchmarks.roaming_recordings import Recording
 from sim_backends.emulated.linux_wifi.virtual_machine import ROOT_VARIABLE
 from sim_backends.radio.infrastructure import roaming
 from tests.helpers.paths import ROOT
@@ -16,17 +17,17 @@ from tests.helpers.paths import ROOT
 
 @pytest.fixture(scope="module")
 def events() -> Callable[[str], Recording]:
-    return lambda name: study.read(gzip.decompress(study.recording(name).read_bytes()).decode())
+    return lambda name: recordings.read(kernel_recordings.load(recordings.recording(name)))
 
 
-def durations_s(intervals: list[study.Interval]) -> list[float]:
+def durations_s(intervals: list[recordings.Interval]) -> list[float]:
     return [end_s - start_s for start_s, end_s in intervals]
 
 
 def test_scans_last_as_long_as_those_of_the_kernel(events: Callable[[str], Recording]) -> None:
     """The kernel's first absence has one channel if its preparation takes a tick, and so has the last one."""
     (step,) = events("scans").steps("associated scan with packets to the robot")
-    kernel_absences, model_absences = study.absences(step), study.model_absences("64ms")
+    kernel_absences, model_absences = recordings.absences(step), study.model_absences("64ms")
     assert len(kernel_absences) == len(model_absences) == 6
     for part in (kernel_absences, model_absences):
         assert median(durations_s(part)) == pytest.approx(0.128, rel=0.05)
@@ -38,13 +39,13 @@ def test_scans_last_as_long_as_those_of_the_kernel(events: Callable[[str], Recor
 
 def test_passive_scans_of_the_kernel_visit_one_channel_at_a_time(events: Callable[[str], Recording]) -> None:
     (step,) = events("scans").steps("associated scan passive")
-    kernel_absences, model_absences = study.absences(step), study.model_absences("112ms")
+    kernel_absences, model_absences = recordings.absences(step), study.model_absences("112ms")
     assert len(kernel_absences) == len(model_absences) == kernel.CHANNELS
     assert median(durations_s(model_absences)) == pytest.approx(median(durations_s(kernel_absences)), rel=0.03)
 
 
 def test_frames_of_an_association_have_the_sizes_of_the_recording(events: Callable[[str], Recording]) -> None:
-    complete = list(study.associations(events("associations")))
+    complete = list(recordings.associations(events("associations")))
     sizes = {tuple(frame.size_bytes for frame in frames) for frames in complete}
     reassociation = tuple(step.size_bytes for step in (*roaming._OPEN, *roaming._REASSOCIATION, *roaming._HANDSHAKE))
     sae = tuple(step.size_bytes for step in (*roaming._SAE, *roaming._REASSOCIATION, *roaming._SAE_HANDSHAKE))
@@ -53,7 +54,7 @@ def test_frames_of_an_association_have_the_sizes_of_the_recording(events: Callab
 
 def test_losses_of_the_link_are_detected_at_the_times_of_the_kernel(events: Callable[[str], Recording]) -> None:
     """Both times are uniform in a second. The robots of fieldkit leave up to a beacon interval after a beacon."""
-    losses = study.link_losses_s(events("associations"))
+    losses = recordings.link_losses_s(events("associations"))
     assert {nulls for _, nulls, _ in losses} == {roaming._NULL_FRAMES}
     assert all(0.717 - 0.1 <= loss_s <= 1.717 for loss_s, _, _ in losses)
     model_s = [study.model_link_loss_s(seed) for seed in range(10)]
@@ -64,7 +65,7 @@ def test_losses_of_the_link_are_detected_at_the_times_of_the_kernel(events: Call
 @pytest.mark.parametrize("name", kernel.SCANS)
 def test_a_walk_has_the_handovers_of_the_kernel(name: str, events: Callable[[str], Recording]) -> None:
     (step,) = events("walks").steps(f"walk {name}")
-    kernel_moves, model_moves = study.handovers(step), study.model_walk(name, 1)
+    kernel_moves, model_moves = recordings.handovers(step), study.model_walk(name, 1)
     assert [new for _, new, _ in model_moves] == [new for _, new, _ in kernel_moves] == ["right"]
     assert model_moves[0][0] == pytest.approx(kernel_moves[0][0], abs=1)
     # The packets are 20 ms apart. Linux needs up to 35 ms more for programs on an emulated processor.
@@ -75,7 +76,7 @@ def test_a_walk_has_the_handovers_of_the_kernel(name: str, events: Callable[[str
 def test_delays_of_a_sleeping_robot_have_the_distribution_of_the_kernel(
     kind: str, events: Callable[[str], Recording]
 ) -> None:
-    kernel_s = study.delays_s(events("power-save"), kind)
+    kernel_s = recordings.delays_s(events("power-save"), kind)
     model_s = study.model_delays_s(study.DESTINATIONS[kind])
     # Critical value of the test of Kolmogorov and Smirnov at 1 %.
     bound = 1.63 * ((len(kernel_s) + len(model_s)) / (len(kernel_s) * len(model_s))) ** 0.5
@@ -84,10 +85,10 @@ def test_delays_of_a_sleeping_robot_have_the_distribution_of_the_kernel(
 
 def test_a_robot_of_the_kernel_sleeps_after_the_time_of_the_model(events: Callable[[str], Recording]) -> None:
     recording = events("power-save")
-    times_s = study.awake_times_s(recording)
+    times_s = recordings.awake_times_s(recording)
     assert len(times_s) > 100
     assert median(times_s) == pytest.approx(0.1, abs=0.008)  # two ticks
-    assert max(study.delays_s(recording, "frequent packet")[3:]) < 0.02, "frequent packets keep it awake"
+    assert max(recordings.delays_s(recording, "frequent packet")[3:]) < 0.02, "frequent packets keep it awake"
 
 
 def test_the_distance_of_distributions() -> None:
@@ -112,12 +113,12 @@ def test_the_distance_of_distributions() -> None:
     ],
 )
 def test_kinds_of_frames(frame: bytes, kind: str) -> None:
-    assert kernel.frame_kind(frame) == kind
+    assert roaming_lab.frame_kind(frame) == kind
 
 
 @pytest.mark.emulated
 @pytest.mark.nightly
 def test_the_scans_of_a_virtual_machine_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(ROOT_VARIABLE, str(ROOT / ".linux"))
-    (step,) = study.read(study.record("scans")).steps("associated scan passive")
-    assert len(study.absences(step)) == kernel.CHANNELS
+    (step,) = recordings.read(recordings.record("scans")).steps("associated scan passive")
+    assert len(recordings.absences(step)) == kernel.CHANNELS

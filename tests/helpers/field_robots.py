@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.config.locations import SITE_FILE
@@ -21,6 +22,9 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.forwarder import Forwarder
 from tests.helpers.labs import built_in_ros
 from tests.helpers.sshd import make_key
+
+_HIDE_SUDO: Final = 'sudo=$(command -v sudo) || exit 0; mount --bind /dev/null "$sudo"'
+"""Robots share the programs of this machine, but they have no sudo, so that results do not depend on this machine."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ def start_field_robots(
     with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
+        for shell in testbed.shells.values():
+            shell.run(("sh", "-c", _HIDE_SUDO), deadline=Deadline.after(30))
         with Forwarder({role: robot.connect for role, robot in testbed.robots.items()}) as links:
             field_robots = FieldRobots(folder, cast, testbed, links)
             (folder / SITE_FILE).write_text(_site(field_robots, topology), encoding="utf-8")

@@ -117,7 +117,7 @@ def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: 
     aggregated = qos & (integers.u8(mac + qos_at) & 0x80 != 0)
     header = header + 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
-    # In a mesh, a control field of 6 bytes and up to 2 addresses follow the MAC header (9.2.4.8.3). Outside of a
+    # In a mesh, a control field of 6 bytes and up to 2 addresses follow the MAC header (9.2.4.7.3). Outside of a
     # mesh, the bit that announces it has another meaning.
     may_be_mesh = qos & (integers.u8(mac + qos_at + 1) & 0x01 != 0) & (integers.u32(llc) != _SNAP)
     llc += may_be_mesh * (6 + 6 * (integers.u8(llc) & 0x03))

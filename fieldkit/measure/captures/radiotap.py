@@ -1,6 +1,6 @@
 """Frames of IEEE 802.11 with radiotap headers as columns: rate, signal and retransmissions.
 
-Sources: https://www.radiotap.org; IEEE 802.11-2020, 9.2 (MAC header), 19.3.5 and 21.5 (rates of HT and VHT).
+Sources: https://www.radiotap.org; IEEE 802.11-2020, 9.2 (MAC header), 19.5 and 21.5 (rates of HT and VHT).
 mac80211 adds the field `TX flags` only to frames that its radio has sent. These frames have no signal.
 """
 

@@ -1,12 +1,16 @@
 """Parts of iperf3's JSON: fields of a checked type, the parameters of the test (`start`) and its totals (`end`)."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 _MAX_COUNT: Final = 2**53
 """Larger integers are not exact as a float."""
+_VERSION: Final = re.compile(r"iperf (\d{1,4})\.(\d{1,4})")
+_FIRST_WITH_THREADS: Final = (3, 16)
+"""First version that has a thread per stream, according to its release notes."""
 
 
 def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -45,6 +49,7 @@ class IperfStart:
         streams: Number of parallel streams.
         block_bytes: Bytes per write; for UDP, the payload of a datagram.
         reverse: True if the server sends.
+        has_threads: True from version 3.16 on, which has a thread per stream.
     """
 
     cookie: str = ""
@@ -53,6 +58,7 @@ class IperfStart:
     streams: int | None = None
     block_bytes: int | None = None
     reverse: bool | None = None
+    has_threads: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,7 @@ def parse_start(document: Mapping[str, Any]) -> IperfStart:
     start = mapping(document, "start")
     test = mapping(start, "test_start")
     cookie, protocol, reverse = start.get("cookie"), test.get("protocol"), number(test, "reverse")
+    version = _VERSION.match(str(start.get("version")))
     return IperfStart(
         cookie=cookie if isinstance(cookie, str) else "",
         start_utc_s=count(mapping(start, "timestamp"), "timesecs"),
@@ -95,6 +102,7 @@ def parse_start(document: Mapping[str, Any]) -> IperfStart:
         streams=count(test, "num_streams"),
         block_bytes=count(test, "blksize"),
         reverse=None if reverse is None else bool(reverse),
+        has_threads=version is not None and (int(version[1]), int(version[2])) >= _FIRST_WITH_THREADS,
     )
 
 

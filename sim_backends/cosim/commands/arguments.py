@@ -1,16 +1,24 @@
 """The arguments of `fieldkit cosim` and its commands; modules that only a running command needs are not imported."""
 
-from collections.abc import Callable, Iterable
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from fieldkit.cli.parser import Commands, Parser
 from fieldkit.cli.shared_arguments import add_jobs, add_json, add_workers, natural, repeats
+from sim_backends.cosim.commands.scenario_arguments import (
+    RECORDING_HELP,
+    add_changes,
+    add_federates,
+    add_format,
+    add_policy,
+    add_recording,
+    add_scenario,
+    add_seed,
+    add_seeds,
+    add_window,
+)
 
 _PACKAGE: Final = "sim_backends.cosim.commands"
-_FORMATS: Final = ("table", "csv", "json", "markdown")
-_RECORDING_HELP: Final = "folder that `fieldkit cosim run --out` made"
 _TABLES: Final = ("1", "2", "3", "emane", "claims")
 
 
@@ -42,12 +50,12 @@ def _add_run(commands: Commands) -> None:
         description="Run a scenario with one sync policy, and report the packets of each flow.",
         epilog="example: fieldkit cosim run baylands --seeds 20 --out runs/baylands",
     )
-    _add_scenario(parser)
-    _add_policy(parser, "sync policy (default: the scenario's)")
-    _add_window(parser, "window of the sync policy")
-    _add_seeds(parser)
+    add_scenario(parser)
+    add_policy(parser, "sync policy (default: the scenario's)")
+    add_window(parser, "window of the sync policy")
+    add_seeds(parser)
     add_jobs(parser)
-    _add_federates(parser)
+    add_federates(parser)
     parser.add_argument(
         "--emane-events",
         metavar="GROUP:PORT",
@@ -76,7 +84,7 @@ def _add_run(commands: Commands) -> None:
         metavar="TIME",
         help="longest wait for an answer of physics or network, in wall time (default 30s)",
     )
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.run:run")
 
 
@@ -89,7 +97,7 @@ def _add_sweep(commands: Commands) -> None:
         epilog="example: fieldkit cosim sweep baylands --over policy=sliding_window,scheduled window=1ms,10ms "
         "distance=20m,40m --seeds 20 -o sweep",
     )
-    _add_scenario(parser)
+    add_scenario(parser)
     parser.add_argument(
         "--over",
         nargs="+",
@@ -98,8 +106,8 @@ def _add_sweep(commands: Commands) -> None:
         help="settings with their values: policy, window, distance (between the ends of the first flow), physics, "
         "network, or a key of the scenario's file, for example radio.exponent=2,3",
     )
-    _add_seeds(parser)
-    _add_federates(parser)
+    add_seeds(parser)
+    add_federates(parser)
     parser.add_argument(
         "-o",
         "--out",
@@ -124,17 +132,17 @@ def _add_shootout(commands: Commands) -> None:
         "reference with the same seed, and the cost of the policy.",
         epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
     )
-    _add_scenario(parser)
-    _add_policy(parser, "sync policy; may be given more than once (default: all)", action="append", default=[])
-    _add_window(
+    add_scenario(parser)
+    add_policy(parser, "sync policy; may be given more than once (default: all)", action="append", default=[])
+    add_window(
         parser,
         "windows to compare",
         dest="windows",
         metavar="TIME,...",
         help="windows to compare (default: the scenario's; with --orders 1 to 100 ms); --bias uses only the shortest",
     )
-    _add_seeds(parser)
-    _add_federates(parser)
+    add_seeds(parser)
+    add_federates(parser)
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--bias", action="store_true", help="mean difference from the reference over seeds")
     modes.add_argument(
@@ -154,7 +162,7 @@ def _add_shootout(commands: Commands) -> None:
         help="draw error against cost, with --orders error against the window, with --bias the bias: SVG, PDF or PNG",
     )
     add_workers(parser)
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
 
@@ -173,13 +181,13 @@ def _add_table(commands: Commands) -> None:
         help="1, 2 or 3: tables of the paper's simulations; emane: its emulation; claims: its claims",
     )
     seeds = parser.add_mutually_exclusive_group()
-    _add_seed(seeds, "the seeds of --seeds")
+    add_seed(seeds, "the seeds of --seeds")
     seeds.add_argument(
         "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
     )
-    _add_changes(parser)
+    add_changes(parser)
     add_workers(parser)
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.table:run")
 
 
@@ -192,7 +200,7 @@ def _add_satisfy(commands: Commands) -> None:
         "exact reference.",
         epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%",
     )
-    _add_scenario(parser)
+    add_scenario(parser)
     parser.add_argument(
         "--threshold", required=True, metavar="SHARE", help="accepted loss, as a share of all packets: 10%%"
     )
@@ -202,12 +210,12 @@ def _add_satisfy(commands: Commands) -> None:
         default="velocity_aware_raw",
         help="rule of the paper as printed (default), or corrected so that each window is positive",
     )
-    _add_window(parser, "window of the first round")
+    add_window(parser, "window of the first round")
     parser.add_argument(
         "--rounds", type=repeats, default=20, metavar="N", help="largest number of rounds (default 20)"
     )
-    _add_seed(parser, "the first seed of the scenario")
-    _add_format(parser)
+    add_seed(parser, "the first seed of the scenario")
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
 
 
@@ -221,9 +229,9 @@ def _add_goodput(commands: Commands) -> None:
         epilog="example: fieldkit cosim goodput links.csv --format csv",
     )
     parser.add_argument("log", type=Path, metavar="LOG", help="the CSV file")
-    _add_changes(parser, "change a value of the scenario that simulates a link, for example radio.queue_packets=100")
+    add_changes(parser, "change a value of the scenario that simulates a link, for example radio.queue_packets=100")
     add_workers(parser)
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.goodput:run")
 
 
@@ -235,7 +243,7 @@ def _add_plot(commands: Commands) -> None:
         "Or draw the CSV table of `fieldkit cosim shootout`: errors against cost.",
         epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
     )
-    _add_recording(parser, f"{_RECORDING_HELP}, or CSV table of a shootout")
+    add_recording(parser, f"{RECORDING_HELP}, or CSV table of a shootout")
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("run.svg"), metavar="FILE", help="SVG, PDF or PNG (default run.svg)"
     )
@@ -248,9 +256,9 @@ def _add_replay(commands: Commands) -> None:
         help="print the results of a recording",
         description="Print the results of a recorded run; a recording that was changed or truncated is an error.",
     )
-    _add_recording(parser)
+    add_recording(parser)
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write the recording as MCAP, for Foxglove")
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.replay:run")
 
 
@@ -274,7 +282,7 @@ def _add_conform(commands: Commands) -> None:
     parser.add_argument(
         "--scenario", default="convoy", metavar="SCENARIO", help="scenario for the checks (default convoy)"
     )
-    _add_changes(parser)
+    add_changes(parser)
     parser.add_argument(
         "--windows",
         type=natural,
@@ -294,7 +302,7 @@ def _add_sdf(commands: Commands) -> None:
         description="Print the world of a scenario and its robots as SDF, for --physics gazebo.",
         epilog="example: fieldkit cosim sdf convoy > convoy.sdf",
     )
-    _add_scenario(parser)
+    add_scenario(parser)
     parser.add_choice(
         "--gazebo",
         ("fortress", "garden"),
@@ -310,7 +318,7 @@ def _add_list(commands: Commands) -> None:
         help="list scenarios, simulators and sync policies",
         description="List every scenario, simulator and sync policy.",
     )
-    _add_format(parser)
+    add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.listing:list_all")
 
 
@@ -321,81 +329,3 @@ def _add_schema(commands: Commands) -> None:
         description="Print the JSON schema of scenario files. Editors use it to complete and check these files.",
     )
     parser.set_defaults(run=f"{_PACKAGE}.listing:print_schema")
-
-
-def _add_scenario(parser: Parser) -> None:
-    """Add the scenario and the options that change it; `settings.read_scenario` reads both."""
-    scenario = parser.add_argument(
-        "scenario",
-        metavar="SCENARIO",
-        help="name of a scenario, see `fieldkit cosim list`, or a file ending in .yaml",
-    )
-    _set_completer(scenario, _scenario_names)
-    parser.add_argument("--duration", metavar="TIME", help="duration of the simulation, for example 30s")
-    _add_changes(parser)
-
-
-def _add_changes(
-    parser: Parser, meaning: str = "change a value of the scenario's file, for example agents.husky-2.along=40m"
-) -> None:
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{meaning}; may be repeated")
-
-
-def _add_recording(parser: Parser, meaning: str = _RECORDING_HELP) -> None:
-    parser.add_argument("recording", type=Path, metavar="RECORDING", help=meaning)
-
-
-def _add_federates(parser: Parser) -> None:
-    for role in ("physics", "network"):
-        action = parser.add_argument(
-            f"--{role}",
-            metavar="FEDERATE",
-            help=f"{role}: a simulator of `fieldkit cosim list`, a command, or an address of tcp, udp, dds or ros1 "
-            "(addresses: fieldkit docs federates; default: the scenario's)",
-        )
-        _set_completer(action, partial(_federate_names, role))
-
-
-def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
-    _set_completer(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
-
-
-def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
-    parser.add_argument("--window", **{"metavar": "TIME", "help": f"{meaning} (default: the scenario's)", **options})
-
-
-def _add_seed(parser: Any, default: str) -> None:  # noqa: ANN401 (a parser or a group of arguments)
-    parser.add_argument("--seed", type=natural, metavar="N", help=f"seed of all random draws (default: {default})")
-
-
-def _add_seeds(parser: Parser) -> None:
-    seeds = parser.add_mutually_exclusive_group()
-    _add_seed(seeds, "all seeds of the scenario")
-    seeds.add_argument("--seeds", type=repeats, metavar="N", help="run the scenario N times, with seeds 1 to N")
-
-
-def _add_format(parser: Parser) -> None:
-    parser.add_choice("--format", _FORMATS, default="table", help="output format (default table)")
-
-
-def _set_completer(action: Any, names: Callable[[], Iterable[str]]) -> None:  # noqa: ANN401 (argparse's is generic)
-    """Complete an argument with names that are determined when the Tab key is pressed."""
-    action.completer = lambda **_: list(names())
-
-
-def _scenario_names() -> Iterable[str]:
-    from sim_backends.cosim.scenario.loading import scenario_files  # noqa: PLC0415 (importing pydantic is slow)
-
-    return [*scenario_files(), *map(str, Path().glob("*.yaml"))]
-
-
-def _policy_names() -> Iterable[str]:
-    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (importing pydantic is slow)
-
-    return policies()
-
-
-def _federate_names(role: str) -> Iterable[str]:
-    from sim_backends.cosim.scenario.external import simulators  # noqa: PLC0415 (importing pydantic is slow)
-
-    return [simulator.name for simulator in simulators() if simulator.role == role]

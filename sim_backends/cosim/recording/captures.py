@@ -28,9 +28,9 @@ _ICMP, _TCP, _UDP = 1, 6, 17
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
 """Address of the first robot."""
 _MULTICAST: Final = IPv4Address("239.255.0.1").packed
-"""Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
+"""Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.2)."""
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
-"""Ports of DDS: for user data of the first participant of a host, and for discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
+"""Ports of DDS: for user data of the first participant of a host, and for discovery (DDSI-RTPS 2.5, 9.6.2.3)."""
 _FIRST_PORT: Final = 40_000
 """Destination port of the first flow; each further flow has the next port."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000

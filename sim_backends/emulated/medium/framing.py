@@ -20,7 +20,7 @@ _ETHERNET_BYTES: Final = 14
 _IPV4_TYPE: Final = b"\x08\x00"
 _GROUP_BIT: Final = 0x01
 """Bit of the first byte of a MAC address that marks broadcast and multicast."""
-# Locally administered, not a group address: IEEE 802-2014, 8.2.
+# Locally administered, not a group address: IEEE 802-2014, clause 8.
 _MAC_PREFIX: Final = b"\x02\x00"
 _LIMITED_BROADCAST: Final = b"\xff\xff\xff\xff"
 

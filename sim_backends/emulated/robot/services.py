@@ -92,6 +92,7 @@ def _run(name: str, work: Callable[[], None], log: Path) -> int:
         _detach(log)
         work()
     except BaseException:  # noqa: BLE001 (every error must end this process, not return into the code of its parent)
+        sys.stdout.flush()  # so that the output precedes the traceback in the log
         sys.excepthook(*sys.exc_info())
         return 1
     finally:

@@ -111,7 +111,7 @@ class NewReno:
 
 
 _NS_PER_S_CUBED: Final = 10**27
-# RFC 9438, 4.1 and 4.6: C is 0.4 segments per s^3, beta is 0.7.
+# RFC 9438, 5.1 and 4.6: C is 0.4 segments per s^3, beta is 0.7.
 _C: Final = 4, 10
 _BETA: Final = 7, 10
 # 4.3: alpha is 3 (1 - beta) / (1 + beta) = 9 / 17.

@@ -169,7 +169,7 @@ class Sender:
             self._start_recovery(lost_segment)
 
     def _on_reordering_timeout(self) -> None:
-        """Detect losses after the reordering window has passed (RFC 8985, 6.3)."""
+        """Detect losses after the reordering window has passed (RFC 8985, 6.2, step 5)."""
         if self._is_open:
             self._detect_losses()
             if self._reduction is not None:

@@ -33,8 +33,8 @@ class _Step(NamedTuple):
         size_bytes: Its size with MAC header and FCS.
         is_from_robot: True if the robot sends it.
         timeout_ns: Time after which it is sent again if it was not received: for responses and requests
-            `IEEE80211_AUTH_TIMEOUT_SHORT` and `IEEE80211_ASSOC_TIMEOUT_SHORT` of mlme.c, for others the timeouts of
-            hostapd's wpa_auth.c.
+            `IEEE80211_AUTH_TIMEOUT_SHORT` (`IEEE80211_AUTH_TIMEOUT_SAE` in SAE) and `IEEE80211_ASSOC_TIMEOUT_SHORT`
+            of mlme.c, for others the timeouts of hostapd's wpa_auth.c.
     """
 
     kind: str
@@ -46,7 +46,9 @@ class _Step(NamedTuple):
 _AUTHENTICATION: Final = "authentication"
 _REQUEST: Final = "reassociation request"
 _OPEN: Final = (_Step(_AUTHENTICATION, 34, True), _Step(_AUTHENTICATION, 34, False))
-_SAE: Final = tuple(_Step(_AUTHENTICATION, size, is_robot) for size in (132, 68) for is_robot in (True, False))
+_SAE: Final = tuple(
+    _Step(_AUTHENTICATION, size, is_robot, 2_000_000_000) for size in (132, 68) for is_robot in (True, False)
+)
 _REASSOCIATION: Final = (_Step(_REQUEST, 159, True), _Step("reassociation response", 143, False))
 
 

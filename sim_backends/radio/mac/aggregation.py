@@ -56,7 +56,8 @@ AMPDU_LIMITS: Final[dict[PhyFormat, AmpduLimits]] = {
     "HE": AmpduLimits(256, 4_194_303),
 }
 """Limits by the exponent of the maximum A-MPDU length: the largest exponent of HT (9.4.2.55.3) and VHT (9.4.2.157.2),
-and exponent extension 2 of HE (9.4.2.248). At all modelled rates of VHT and HE, `MAX_PPDU_NS` is reached first."""
+and exponent extension 2 of HE (9.4.2.248.2) at 5 and 6 GHz. At all modelled rates of VHT and HE, `MAX_PPDU_NS` is
+reached first, at 2.4 GHz too: extension 3 permits 524,287 bytes there."""
 
 
 @dataclass(eq=False, slots=True)

@@ -27,22 +27,19 @@ from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.phy.modes import ACK_BYTES, PhyFormat, WifiMode
 
 SUBFRAME_HEADER_BYTES: Final = 14
-"""Destination, source and length before each packet: figure 9-71."""
+"""Destination, source and length before each packet: 9.3.2.2.2."""
 _LLC_BYTES: Final = 8
 """LLC and SNAP of each packet: RFC 1042."""
 FRAME_OVERHEAD_BYTES: Final = QOS_HEADER_BYTES - _LLC_BYTES
 """MAC header and FCS of a frame."""
 
 _MAX_FRAME_BYTES: Final[dict[PhyFormat, int]] = {"HT": 4_095, "VHT": 11_454, "HE": 11_454}
-"""Largest frame in an A-MPDU: 9.4.2.55.3 (length in the delimiter), table 9-34."""
-HT_AMSDU_BYTES: Final = 3_839
-"""Limit of A-MSDUs in an A-MPDU of HT: the smaller of the two limits of HT. With the larger one, 7,935 bytes, a frame
-would exceed its maximum size."""
+"""Largest frame in an A-MPDU: table 9-25; in HT, the largest length in the delimiter (10.12.2)."""
 
 
 def limits_with_amsdu(phy_format: PhyFormat, max_bytes: int) -> AmpduLimits:
     """Return the limits of aggregates whose frames have A-MSDUs up to `max_bytes`."""
-    format_bytes = HT_AMSDU_BYTES if phy_format == "HT" else _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
+    format_bytes = _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
     return replace(AMPDU_LIMITS[phy_format], amsdu_bytes=min(max_bytes, format_bytes))
 
 

@@ -49,7 +49,7 @@ _MCS: Final[tuple[tuple[Modulation, Fraction], ...]] = (
 )
 _MCS_COUNT: Final[dict[HighThroughput, int]] = {"HT": 8, "VHT": 10, "HE": 12}
 
-# Data subcarriers by width, N_SD: tables 19-6, 21-5 and 27-16 (one resource unit of 242, 484 or 996 tones).
+# Data subcarriers by width, N_SD: tables 19-6, 21-5 and 27-14 (one resource unit of 242, 484 or 996 tones).
 _SUBCARRIERS: Final[dict[HighThroughput, dict[int, int]]] = {
     "HT": {20: 52, 40: 108},
     "VHT": {20: 52, 40: 108, 80: 234},

@@ -14,7 +14,7 @@ NEAREST_M: Final = 1.0
 
 
 def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
-    """Return the loss in free space, 20 log10(4 pi d f / c), of paths of shape (n, 3): ITU-R P.525, eq. 3."""
+    """Return the loss in free space, 20 log10(4 pi d f / c), of paths of shape (n, 3): ITU-R P.525."""
     return _friis_db(_length_m(start_m, end_m), frequency_hz)
 
 

@@ -75,7 +75,7 @@ def test_a_sent_frame_has_retries_and_no_signal(tmp_path: Path, tx_flags: int, *
     ],
 )
 def test_rates_of_ht_and_vht(tmp_path: Path, bit: int, fields: tuple[int, ...], rate_bit_s: int) -> None:
-    """The rates are those of IEEE 802.11-2020, tables 19-27 to 19-34 and 21-30 to 21-61."""
+    """The rates are those of IEEE 802.11-2020, tables 19-27 to 19-34 and 21-29 to 21-60."""
     assert read_one(tmp_path, header(1 << bit, bytes(fields)) + PLAIN).rate_bit_s[0] == rate_bit_s
 
 

@@ -17,7 +17,8 @@ from fieldkit.measure.checks.iperf3_checks import IperfSettings
 from fieldkit.measure.evidence import iperf3
 from tests.helpers.paths import DATA
 
-VERSIONS = ("3.1.3", "3.7", "3.12", "3.17.1")
+VERSIONS = ("3.1.3", "3.7", "3.12", "3.17.1", "3.18")
+WITH_THREADS = ("3.17.1", "3.18")
 TESTS = ("tcp", "udp", "udp-reverse")
 NUMBERS = ("bytes", "seconds", "packets", "lost_packets", "retransmits")
 
@@ -47,6 +48,22 @@ def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: A
 @pytest.mark.parametrize("test", TESTS)
 def test_both_ends_of_a_real_test_have_no_contradiction(version: str, test: str) -> None:
     assert contradictions(document(version, test, "client"), document(version, test, "server"), test) == []
+
+
+@pytest.mark.parametrize("end", ["client", "server"])
+@pytest.mark.parametrize(("uncounted", "is_possible"), [(1, True), (5, True), (6, False), (-1, False)])
+def test_intervals_of_versions_with_threads_may_lack_one_percent(
+    end: str, uncounted: int, *, is_possible: bool
+) -> None:
+    """The main thread of iperf3 sets the bytes of an interval to 0 while the thread of the stream adds to them."""
+    for version in ("3.12", "3.18"):
+        ends = {name: document(version, "udp", name) for name in ("client", "server")}
+        interval = ends[end]["intervals"][1]
+        for counts in (interval["sum"], *interval["streams"]):
+            counts["bytes"] -= uncounted * 1400
+            counts["bits_per_second"] = 8 * counts["bytes"] / counts["seconds"]
+        has_no_contradiction = not contradictions(ends["client"], ends["server"], "udp")
+        assert has_no_contradiction is (is_possible and version == "3.18")
 
 
 @given(
@@ -80,7 +97,8 @@ def test_a_missing_interval_is_a_contradiction(version: str, test: str, number: 
     receiver = ends["client" if test.endswith("reverse") else "server"]
     removed_interval = receiver["intervals"].pop(number % len(receiver["intervals"]))
     reasons = contradictions(ends["client"], ends["server"], test)
-    assert reasons or removed_interval["sum"]["bytes"] == 0, "an interval without data changes no column"
+    may_lack_bytes = 3 * (128 << 10 if test == "tcp" else 1400) if version in WITH_THREADS else 0
+    assert reasons or removed_interval["sum"]["bytes"] <= may_lack_bytes, "a column would change"
 
 
 @pytest.mark.parametrize("version", VERSIONS)

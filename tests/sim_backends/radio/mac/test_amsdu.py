@@ -63,7 +63,7 @@ def test_frames_are_as_large_as_their_limits_permit(sizes_bytes: list[int], maxi
     assert [packet.payload for packet in aggregate.frames] == list(range(len(sizes_bytes)))
     assert aggregate.frame_count == len(frames)
     largest_frame = 4095 if mode is HT20_7 else 11_454
-    msdu_limit = min(maximum, 3839 if mode is HT20_7 else 11_454 - 30)
+    msdu_limit = min(maximum, 4065 if mode is HT20_7 else 11_454 - 30)
     size_bytes = 0
     for frame in frames:
         frame_size = scapy_frame_bytes([packet.size_bytes for packet in frame])
@@ -78,9 +78,10 @@ def test_frames_are_as_large_as_their_limits_permit(sizes_bytes: list[int], maxi
 
 @pytest.mark.parametrize(
     ("phy_format", "maximum", "expected"),
-    [("HT", 3839, 3839), ("HT", 7935, 3839), ("VHT", 7935, 7935), ("HE", 11454, 11424)],
+    [("HT", 3839, 3839), ("HT", 7935, 4065), ("VHT", 7935, 7935), ("HE", 11454, 11424)],
 )
 def test_formats_limit_the_size(phy_format: PhyFormat, maximum: int, expected: int) -> None:
+    """In a Block Ack session of HT, the limit is min(max_amsdu_len, 4065): include/net/mac80211.h of Linux."""
     assert limits_with_amsdu(phy_format, maximum).amsdu_bytes == expected
 
 
