@@ -6,6 +6,7 @@ allowed; no code is executed. A comparison with a missing value is neither true 
 """
 
 import ast
+import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -200,7 +201,18 @@ def _values(node: ast.expr, rows: Repeats) -> tuple[NDArray[Any], Mask]:
     if isinstance(node, ast.Name) and node.id in rows.numbers:
         numbers = rows.numbers[node.id]
         return numbers, np.isnan(numbers)
-    value = _BOOLEANS[node.id] if isinstance(node, ast.Name) else ast.literal_eval(node)
+    value = _BOOLEANS[node.id] if isinstance(node, ast.Name) else _constant(node)
     return np.full(len(rows), value, np.object_ if isinstance(value, str) else np.float64), np.zeros(
         len(rows), np.bool_
     )
+
+
+def _constant(node: ast.expr) -> str | float:
+    """Return a constant; an integer beyond the range of a float is infinite, as the literal `1e400` is."""
+    value: str | float = ast.literal_eval(node)
+    if isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf

@@ -170,7 +170,10 @@ def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> ND
     """Return quantile²/trials of a score interval with the half-width `half`; infinity for 1/2 and more."""
     spread, square = share * (1 - share), half**2
     a, b = 0.25 - square, spread - 2 * square
-    return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)
+    root = np.sqrt(b * b + 4 * a * square)
+    # Of the two forms of the solution, each is used where it has no difference of nearly equal numbers.
+    solution = np.where(b > 0, 2 * square / (root + b), (root - b) / (2 * a))
+    return np.where(half < 0.5, solution, np.inf)
 
 
 def _with_student(

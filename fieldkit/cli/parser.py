@@ -11,6 +11,7 @@ import difflib
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from functools import partial
 from importlib.metadata import EntryPoint
 from typing import Any, Final, NoReturn
@@ -42,6 +43,7 @@ class Parser(argparse.ArgumentParser):
         self.is_foreign = False
         self._commands: Commands = None
         self._words: Sequence[str] = ()
+        self._is_intermixing = False
 
     def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (passed to argparse unchanged)
         """Return the object of `add_subparsers`; an error about an unknown subcommand contains the most similar one.
@@ -97,10 +99,29 @@ class Parser(argparse.ArgumentParser):
             # argparse does not parse a word with a leading space as an option. Converters of lengths
             # remove the space.
             words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
-        arguments, unknown = super().parse_known_args(words, namespace)
+        if self._is_intermixing:
+            return super().parse_known_args(words, namespace)
+        arguments, unknown = super().parse_known_args(words, copy(namespace))
+        if option := next((word for word in unknown if word.startswith("-")), None):
+            raise self._unknown(option)
+        if unknown and self._can_intermix():
+            # argparse assigns words to a list only up to the next option: `compare A --force B`.
+            self._is_intermixing = True
+            try:
+                arguments, unknown = self.parse_known_intermixed_args(words, copy(namespace))
+            finally:
+                self._is_intermixing = False
         if unknown:
             raise self._unknown(unknown[0])
         return arguments, unknown
+
+    def _can_intermix(self) -> bool:
+        """Return True if argparse can parse options between the words of this command."""
+        grouped = {id(action) for group in self._mutually_exclusive_groups for action in group._group_actions}  # noqa: SLF001 (argparse has no public list)
+        return not any(
+            action.nargs in {argparse.PARSER, argparse.REMAINDER} or id(action) in grouped
+            for action in self._get_positional_actions()
+        )
 
     def _require_command(self, words: Sequence[str]) -> None:
         """Raise an error for an unknown subcommand. Only options without values can precede a subcommand."""

@@ -97,7 +97,7 @@ def add_robots(parser: Parser) -> None:
     """Add the options that select the robots of a lab."""
     add_site(parser, "emulated")
     parser.add_argument(
-        "--robots", type=int, metavar="N", help="use robots robot-1 to robot-N instead of those in the site file"
+        "--robots", type=natural, metavar="N", help="use robots robot-1 to robot-N instead of those in the site file"
     )
     profile = "turtlebot3_burger"
     parser.add_argument(
@@ -182,10 +182,13 @@ def add_show(parser: Parser, dest: str, what: str) -> None:
 
 
 def file_to_write(text: str) -> Path:
-    """Return a path whose folder exists; argparse reports a missing folder before the trial starts."""
-    if not Path(text).parent.is_dir():
-        raise argparse.ArgumentTypeError(f"there is no folder {str(Path(text).parent)!r}")
-    return Path(text)
+    """Return a path in a folder that exists; argparse reports others, and folders, before the trial starts."""
+    path = Path(text)
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {str(path.parent)!r}")
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is a folder, not a file")
+    return path
 
 
 def natural(text: str, minimum: int = 0) -> int:

@@ -26,4 +26,6 @@ def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[Non
 def backend_name(arguments: argparse.Namespace, site: Site | None) -> str:
     """Return the name of the backend that the options or the site file choose."""
     name: str | None = arguments.backend
-    return name or (DEFAULT_BACKEND if site is None else site.backend)
+    if name is not None:
+        return name
+    return DEFAULT_BACKEND if site is None else site.backend

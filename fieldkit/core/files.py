@@ -36,7 +36,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         if not stat.S_ISLNK(mode) and (reason := special_file_type(mode)):
             raise OSError(errno.EINVAL, reason, str(path))
     try:
-        temporary, descriptor = _create_temporary(path)
+        with _naming_in_errors(path):
+            temporary, descriptor = _create_temporary(path)
         with os.fdopen(descriptor, "wb") as file:
             with suppress(FileNotFoundError):
                 if stat.S_ISREG(mode := path.lstat().st_mode):
@@ -44,7 +45,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            temporary.rename(path)  # before closing the file, which releases its lock
+            with _naming_in_errors(path):
+                temporary.rename(path)  # before closing the file, which releases its lock
             temporary = None
     except OSError as error:
         if error.filename is None:  # the error of a failed write has no file name
@@ -55,6 +57,16 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             with suppress(OSError):  # an error here would hide an earlier error
                 temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
+
+
+@contextmanager
+def _naming_in_errors(path: Path) -> Iterator[None]:
+    """Name a file in an OSError of the body, instead of its temporary file, whose name users do not know."""
+    try:
+        yield
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
 
 
 def _create_temporary(path: Path) -> tuple[Path, int]:
@@ -190,6 +202,11 @@ def _sync(path: Path, flags: int = os.O_RDONLY) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Return True if a write failed because the disk, or the quota of the user, has no free space."""
+    return error.errno in {errno.ENOSPC, errno.EDQUOT}
 
 
 def nearest_existing(folder: Path) -> Path:

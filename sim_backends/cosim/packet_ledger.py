@@ -75,6 +75,18 @@ def _max_distance_m(offsets_m: Sequence[Vector]) -> float:
     return max((math.dist(first, second) for first, second in combinations(offsets_m, 2)), default=0.0)
 
 
+def _completed(
+    assumed_states: Mapping[str, State], true_states: Mapping[str, State], absences: Mapping[str, AgentAbsence]
+) -> tuple[dict[str, State], dict[str, State]]:
+    """Return assumed and true states of all agents, also of those that are absent.
+
+    A state that is missing in one mapping is replaced by the agent's last state, or by the state in the other
+    mapping.
+    """
+    last_states = {name: absence.state for name, absence in absences.items()}
+    return {**true_states, **last_states, **assumed_states}, {**assumed_states, **last_states, **true_states}
+
+
 class PacketLedger:
     """Tracks each packet from its entry to its arrival or drop.
 
@@ -133,13 +145,7 @@ class PacketLedger:
             is_dropped = destination not in true_states or any(
                 name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
-            last_states = {name: absence.state for name, absence in absences.items()}
-            # A state that is missing in one mapping is replaced by the agent's last state, or by the state in the
-            # other mapping.
-            assumed_states, true_states = (
-                {**true_states, **last_states, **assumed_states},
-                {**assumed_states, **last_states, **true_states},
-            )
+            assumed_states, true_states = _completed(assumed_states, true_states, absences)
         try:
             assumed_ends = assumed_states[source], assumed_states[destination]
         except KeyError:
@@ -164,22 +170,33 @@ class PacketLedger:
             enters_ns,
             datagram.protocol,
         )
-        since_step_s = at_ns % self._step_ns / 1e9
-        ends = true_states[source], true_states[destination]
-        if since_step_s:
-            ends = extrapolate(ends[0], since_step_s), extrapolate(ends[1], since_step_s)
-        fate = Fate(packet, assumed_ends, ends)
-        if self._measured_agents or self._has_fixed_emitters:
-            names = self._measured_agents | {source, destination}
-            states = [extrapolate(true_states[name], since_step_s) for name in names]
-            fate.position_error_m = max_position_error_m(
-                assumed_states, states, names, has_fixed_emitters=self._has_fixed_emitters
-            )
+        fate = self._fate(packet, assumed_ends, assumed_states, true_states)
         self._fates[identity] = fate
         if is_dropped:
             fate.reason = ABSENT
         else:
             self._under_way[self._packet_count] = fate, datagram.payload
+        return fate
+
+    def _fate(
+        self,
+        packet: Packet,
+        assumed_ends: tuple[State, State],
+        assumed_states: Mapping[str, State],
+        true_states: Mapping[str, State],
+    ) -> Fate:
+        """Return the fate of a packet, with the true states of its source and destination when it was sent."""
+        since_step_s = packet.sent_ns % self._step_ns / 1e9
+        ends = true_states[packet.source], true_states[packet.destination]
+        if since_step_s:
+            ends = extrapolate(ends[0], since_step_s), extrapolate(ends[1], since_step_s)
+        fate = Fate(packet, assumed_ends, ends)
+        if self._measured_agents or self._has_fixed_emitters:
+            names = self._measured_agents | {packet.source, packet.destination}
+            states = [extrapolate(true_states[name], since_step_s) for name in names]
+            fate.position_error_m = max_position_error_m(
+                assumed_states, states, names, has_fixed_emitters=self._has_fixed_emitters
+            )
         return fate
 
     def withdraw(self, names: Container[str]) -> list[Fate]:

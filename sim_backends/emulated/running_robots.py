@@ -1,8 +1,8 @@
 """Starts the robots of an emulated lab and attaches them to their media."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, Generic
@@ -72,18 +72,10 @@ def running_robots(
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET  # in a mesh, MAC addresses identify the next hop
-        wifi: Mapping[RobotKey, WifiSpec] = {}
-        radios: Mapping[str, HwsimRadio] = {}
-        if options.has_linux_wifi:
-            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
-
-            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio, options.mesh)
-            radios = lab.radios_of(robots.values(), options.radio)
-            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
-        elif options.is_cosimulated:
-            medium = stack.enter_context(_cosimulated_medium(options, world, robots, seed, framing))
-        else:
-            medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
+        wifi, radios = _linux_wifi(robots, options)
+        medium = stack.enter_context(
+            _medium(robots, options, world, seed=seed, framing=framing, wifi=wifi.values(), radios=radios)
+        )
         used_links = {name for robot in robots.values() for name in robot.profile.further_links}
         links = {
             name: stack.enter_context(MediumClient(link_options, world, seed=seed, framing=framing))
@@ -125,6 +117,38 @@ def running_robots(
         )
         for robot in running.values():
             robot.request_exit()
+
+
+def _linux_wifi(
+    robots: "Mapping[RobotKey, Robot | LabRobot]", options: EmulatedOptions
+) -> "tuple[Mapping[RobotKey, WifiSpec], Mapping[str, HwsimRadio]]":
+    """Return the Wi-Fi settings of each robot and the kernel's radios by name; both are empty without Linux Wi-Fi."""
+    if not options.has_linux_wifi:
+        return {}, {}
+    from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
+
+    wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio, options.mesh)
+    return wifi, lab.radios_of(robots.values(), options.radio)
+
+
+def _medium(
+    robots: "Mapping[RobotKey, Robot | LabRobot]",
+    options: EmulatedOptions,
+    world: World,
+    *,
+    seed: int,
+    framing: Framing,
+    wifi: Collection[WifiSpec],
+    radios: "Mapping[str, HwsimRadio]",
+) -> AbstractContextManager[MediumClient]:
+    """Return the medium of the radio under test; `wifi` and `radios` are those of `_linux_wifi`."""
+    if options.has_linux_wifi:
+        from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (as above)
+
+        return lab.medium(options.radio, world, seed, radios, wifi)
+    if options.is_cosimulated:
+        return _cosimulated_medium(options, world, robots, seed, framing)
+    return MediumClient(options.radio, world, seed=seed, framing=framing)
 
 
 def _cosimulated_medium(

@@ -183,6 +183,7 @@ class Connection
     // Publish a command to the agent with an index; returns false if that failed.
     bool Publish(size_t agent, const msgs::Twist& twist)
     {
+        m_unacknowledged.push_back({agent, twist});
         return m_receivers[agent].publisher.Publish(twist);
     }
 
@@ -201,26 +202,58 @@ class Connection
     {
         if (m_usesFence)
         {
-            WorldMonitor::Lock lock(m_monitor.mutex);
-            uint64_t expected = m_passed + 1;
-            lock.unlock();
-            m_fence.Publish(msgs::Empty());
-            lock.lock();
-            m_monitor.Wait(
-                lock, [&] { return m_passed >= expected; },
-                [&] { return "commands have not been acknowledged on " + m_options.Name(m_options.fence_answer); });
-            return;
+            PassFence();
         }
-        if (m_options.acknowledge != "off")
+        else if (m_options.acknowledge != "off")
         {
             for (size_t i = 0; i <= m_receivers.size(); i++)
             {
                 Call(m_options.ControlService(), ControlRequest(0));
             }
         }
+        m_unacknowledged.clear();
     }
 
   private:
+    // Publish the fence, and wait for its answer. Commands and fence are published again after each second, because
+    // Gazebo Transport drops the messages of a topic while a new plugin subscribes to it, as after a reset.
+    void PassFence()
+    {
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        uint64_t before = m_passed, fences = 0;
+        Clock::time_point repeat_at;
+        auto has_passed = [&] {
+            if (m_passed == before && Clock::now() >= repeat_at)
+            {
+                repeat_at = Clock::now() + std::chrono::seconds(1);
+                lock.unlock();
+                for (size_t i = 0; fences > 0 && i < m_unacknowledged.size(); i++)
+                {
+                    m_receivers[m_unacknowledged[i].agent].publisher.Publish(m_unacknowledged[i].twist);
+                }
+                m_fence.Publish(msgs::Empty());
+                fences++;
+                lock.lock();
+            }
+            return m_passed > before;
+        };
+        m_monitor.Wait(lock, has_passed, [&] {
+            return "commands have not been acknowledged on " + m_options.Name(m_options.fence_answer);
+        });
+        if (fences > 1) // a late answer to an earlier fence must not acknowledge the next commands
+        {
+            m_monitor.changed.wait_for(lock, std::chrono::milliseconds(500),
+                                       [&] { return m_passed >= before + fences; });
+        }
+    }
+
+    // A published command.
+    struct SentCommand
+    {
+        size_t agent;
+        msgs::Twist twist;
+    };
+
     // The receiver of the commands to an agent.
     struct CommandReceiver
     {
@@ -325,6 +358,7 @@ class Connection
     std::vector<Agent>& m_agents;
     WorldMonitor& m_monitor;
     std::vector<CommandReceiver> m_receivers; // by index of the agent
+    std::vector<SentCommand> m_unacknowledged;
     bool m_usesFence = false; // see `Acknowledge`
     uint64_t m_passed = 0;    // number of answers to the fence
     transport::Node::Publisher m_fence;

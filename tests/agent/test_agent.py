@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +62,10 @@ class Cable:
     program: Path
 
     def arguments(self, middleware_name: str, host: TestHost, **network: object) -> dict[str, Any]:
+        """Return the arguments of the agent; the middleware keeps all samples for a subscriber that pauses."""
         node = f"fieldkit_{host.pid}"
-        topic = topics.describe(standard_types(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
+        quality = replace(PROFILES["default"], depth=1000)
+        topic = topics.describe(standard_types(), "/stream", TYPE, quality, domain=3, node=node)
         network_arguments = {"address": host.address, "domain": 3, "node": node, **network}
         return {"network": network_arguments, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
 
@@ -153,9 +155,9 @@ def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path)
     ) as subscriber:
         with cable.running(first_host, "publish", cable.arguments("dds", first_host), str(sent_log)) as publisher:
             assert publisher.wait(timeout=60) == 0
+        wait_until(lambda: sequences(received_log) == sequences(sent_log), Deadline.after(60))
         subscriber.kill()
-    received_sequences = [row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE]
-    assert received_sequences == [row[3] for row in topic_logs.rows(sent_log) if row[0] == records.SAMPLE]
+    assert sequences(received_log) == sequences(sent_log)
     assert topic_logs.rows(received_log)[-1][0] == records.SAMPLE
 
 
@@ -270,9 +272,14 @@ def test_forged_heartbeat_silences_a_subscription(cable: Cable, tmp_path: Path) 
         assert 0 <= newest(received_log) <= last_sequence
 
 
+def sequences(log: Path) -> list[int]:
+    """Return the sequence numbers of the samples in a log."""
+    return [row[3] for row in topic_logs.rows(log) if row[0] == records.SAMPLE]
+
+
 def newest(log: Path) -> int:
     """Return the highest sequence number of the samples in a log, -1 if there are none."""
-    return max((row[3] for row in topic_logs.rows(log) if row[0] == records.SAMPLE), default=-1)
+    return max(sequences(log), default=-1)
 
 
 @pytest.mark.emulated
@@ -290,7 +297,7 @@ def test_invalid_tcpros_data_stop_neither_program(cable: Cable, tmp_path: Path) 
                 f"{first_host.address}:40001",
                 f"{second_host.address}:40001",
             )
-            sequences = {row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE}
+            sequences_before = set(sequences(received_log))
             deadline_s = time.monotonic() + 60
-            while {row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE} <= sequences:
+            while set(sequences(received_log)) <= sequences_before:
                 assert time.monotonic() < deadline_s, "no more samples arrive"

@@ -87,6 +87,12 @@ def test_no_more_repeats_are_needed_for_a_narrow_interval(kind: Kind) -> None:
     assert additional_repeats(interval, 20, 0.1499, kind) == 1
 
 
+def test_the_number_of_repeats_for_a_tiny_width_is_proportional_to_its_inverse_square() -> None:
+    interval = Interval(0.2, 0.1, 0.4)
+    thousandth, billionth = (additional_repeats(interval, 20, width, Kind.FLAG) for width in (1e-3, 1e-9))
+    assert billionth == pytest.approx(thousandth * 1e12, rel=1e-3)
+
+
 def test_a_single_repeat_gives_no_number_of_repeats() -> None:
     assert np.isnan(sample_size.additional_repeats(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
 

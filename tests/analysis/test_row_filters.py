@@ -110,6 +110,16 @@ def test_an_invalid_expression_is_refused(text: str, message: str, remedy: str) 
     assert remedy in error_info.value.remedy
 
 
+def test_an_integer_beyond_floats_is_infinite() -> None:
+    rows = parsed(ROWS[:2])
+    for text, expected in (
+        ("distance_m < 1" + "0" * 400, True),
+        ("distance_m > -1" + "0" * 400, True),
+        ("distance_m in [1" + "0" * 400 + "]", False),
+    ):
+        assert parse_filter(text, COLUMNS).mask(rows).tolist() == [expected] * 2, text
+
+
 def test_commands_use_only_the_chosen_rows(tmp_path: Path) -> None:
     rows = [
         replace(COMPARABLE, repeat=number, distance=f"{5 * number}m", distance_m=5.0 * number) for number in (1, 2, 3)

@@ -17,6 +17,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli import commands, main, parser, shared_arguments
 from fieldkit.cli.commands import compare
 from fieldkit.config import documents
+from tests.helpers import runs
 from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
 
@@ -79,7 +80,7 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
         stdout=subprocess.PIPE,
         text=True,
-        timeout=LIMIT_S,
+        timeout=runs.LIMIT_S,
         check=True,
     )
     modules_text = completed.stdout.partition("imported:\n")[2]

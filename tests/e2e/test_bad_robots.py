@@ -104,8 +104,11 @@ def unauthorized_login(lab: Testbed) -> str:
 
 
 def occupied_port(lab: Testbed) -> str:
-    lab.run_on(Role.RECEIVER, "setsid -f nc.traditional -l -p 1234 </dev/null >/dev/null 2>&1")
-    lab.undo.callback(lab.run_on, Role.RECEIVER, "nc.traditional -q 0 127.0.0.1 1234 </dev/null")
+    listens = "grep -q '^ *[0-9]*: 00000000:04D2 ' /proc/net/tcp"
+    start = "setsid -f nc.traditional -l -p 1234 </dev/null >/dev/null 2>&1"
+    lab.run_on(Role.RECEIVER, f"{start}; until {listens}; do sleep 0.05; done")
+    stop = "nc.traditional -q 0 127.0.0.1 1234 </dev/null"
+    lab.undo.callback(lab.run_on, Role.RECEIVER, f"{stop}; while {listens}; do sleep 0.05; done")
     return TRIAL
 
 

@@ -10,6 +10,7 @@ from fieldkit.agent.messaging import records
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.stored import plans
+from tests.helpers.labs import built_in_ros, write_procedure
 from tests.helpers.runs import only_trial, run_here
 from tests.helpers.texts import procedure
 
@@ -41,9 +42,8 @@ def shift_arrivals(content: bytes, by_ns: int) -> bytes:
 
 
 def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
-    (tmp_path / "procedures").mkdir()
-    (tmp_path / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
-    run = run_here(tmp_path, "trial", "stream", "5m", "--yes")
+    built_in_ros(tmp_path)
+    run = run_here(tmp_path, "trial", write_procedure(tmp_path, STREAM), "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
     plan = plans.read_plan(trial)

@@ -142,6 +142,18 @@ def test_a_run_reports_the_same_followers_as_its_recording(lab: Path) -> None:
     assert f"{100 * row['spacing_mean_m']:.3g}" in result.out.partition("followers\n")[2]
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--policy", "event_driven"), "exact policies have no errors in a window"),
+        (("--window", "1ms", "--figure", "orders.svg"), "errors against the window need two windows"),
+    ],
+)
+def test_orders_that_cannot_be_computed_or_drawn_are_refused(lab: Path, words: tuple[str, ...], message: str) -> None:
+    run = cosim(lab, "shootout", "pass.yaml", "--orders", *words)
+    assert (run.code, message in run.err) == (2, True), run.err
+
+
 def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:
     options = ("--policy", "scheduled", "--policy", "time_stepped", "--format", "csv", "--figure", "one.svg")
     table = cosim(lab, "shootout", "pass.yaml", "--window", "5ms,20ms", "--duration", "200ms", *options)
@@ -149,7 +161,11 @@ def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:
     run = cosim(lab, "plot", "all.csv", "--out", "two.svg")
     assert run.code == 0, run.err
     assert (lab / "one.svg").read_text(encoding="utf-8") == (lab / "two.svg").read_text(encoding="utf-8")
-    for text in ("policy,sent\na,1\n", table.out.partition("\n")[0], "\x00"):
+    (lab / "all.csv").write_text("\ufeff" + table.out, encoding="utf-8")
+    assert cosim(lab, "plot", "all.csv", "--out", "two.svg").code == 0, "a spreadsheet begins a file with this mark"
+    head = "policy,exchanges_per_s,delivery_error_mean_s,position_error_mean_m,path_error_max_m\n"
+    huge, tiny = (f"{head}scheduled,10,{number},0.1,0.1\n" for number in ("1e400", "1e-320"))
+    for text in ("policy,sent\na,1\n", table.out.partition("\n")[0], "\x00", huge, tiny):
         (lab / "all.csv").write_text(text, encoding="utf-8")
         rejected_run = cosim(lab, "plot", "all.csv", "--out", "two.svg")
         assert (rejected_run.code, "--format csv" in rejected_run.err) == (4, True), rejected_run.err

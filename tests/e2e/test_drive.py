@@ -62,9 +62,11 @@ ROSTOPIC_MESSAGES = {
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
-"""Lease of the tests in which it expires, and time limit for a command to stop a robot."""
+"""Lease of the tests in which it expires."""
 LONG_LEASE_S = 30.0
 """Lease of the other tests, so that a busy machine does not stop a robot."""
+ORDER_S = 6.0
+"""Time limit for an order to stop a robot. An idle machine needs some tenths of a second (`benchmarks.stop`)."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = texts.procedure(
     "drive",
@@ -155,10 +157,16 @@ def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
 
 def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
-    starts_m = {
-        role: track_of(field_robots, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)
-    }
-    run = run_here(field_robots.folder, *RUN)
+    for _ in range(3):  # a busy machine may suspend a program of a robot for so long that the robot stops
+        shutil.rmtree(field_robots.folder / "trials", ignore_errors=True)
+        field_robots.testbed.place(PLACEMENT)
+        field_robots.testbed.oracle.track(time.time_ns())  # the oracle drops earlier positions
+        starts_m = {
+            role: track_of(field_robots, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)
+        }
+        run = run_here(field_robots.folder, *RUN)
+        if "its program was suspended" not in run.out:
+            break
     assert run.code == 0, run.err + run.out
     trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
@@ -292,7 +300,7 @@ def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots,
         process.send_signal(number)
         stopped_after_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
-    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     assert "stopping: rover-1 stops where it is" in run.err
     assert "rover-1: stopped (stationary)" in run.err
     assert run.code == 130
@@ -341,7 +349,7 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRob
         process.wait()
         reader.join()
         os.close(master)
-    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     text = b"".join(output_parts).decode()
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
@@ -363,7 +371,7 @@ def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) 
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
-    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
+    assert stopped_after_s < ORDER_S, "by the order, not by its lease"
     assert run.code == 130
     assert math.dist(place_m(field_robots), home_m) > 0.3, "it has not reached its home"
     assert_held(field_robots, "stopped by the operator")

@@ -5,9 +5,10 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Request, sync_playwright
+from playwright.sync_api import Request
 
 from tests.helpers import site_links, suites, wheels
+from tests.helpers.browser import TIMEOUT_MS, chromium
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -53,15 +54,14 @@ def test_the_search_of_the_pages_needs_no_server(python: Path) -> None:
     def record_request(request: Request) -> None:
         requested_urls.append(request.url)
 
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+    with chromium() as browser:
         tab = browser.new_context(offline=True, viewport={"width": 1300, "height": 900}).new_page()
+        tab.set_default_timeout(TIMEOUT_MS)
         tab.on("request", record_request)
         tab.goto(page(python, "index").as_uri())
         tab.click(".md-search__input")
         tab.keyboard.type("netcat")
         tab.wait_for_selector(".md-search-result__item")
-        browser.close()
     assert not [url for url in requested_urls if not url.startswith(("file:", "data:", "about:", "blob:"))]
 
 

@@ -12,9 +12,9 @@ from tests.helpers.runs import total
 
 pytestmark = pytest.mark.emulated
 
-FOUR_SIGMA = 0.99994
-"""The confidence level of four standard deviations. The captured packets and the radio's random draws for them differ
-between runs."""
+FIVE_SIGMA = 0.9999994
+"""The confidence level of five standard deviations. The captured packets and the radio's random draws for them differ
+between runs. With four standard deviations, one run of this module in 400 failed."""
 FRAGMENTS = 6  # of a datagram of 8,192 bytes in packets of 1,500
 
 
@@ -40,7 +40,7 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
     sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
     assert sent > len(table) * 20
     interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
-        confidence_level=FOUR_SIGMA, method="wilson"
+        confidence_level=FIVE_SIGMA, method="wilson"
     )
     assert interval.low <= percent / 100 <= interval.high, (sent, received)
 
@@ -54,15 +54,15 @@ def test_runs_of_independent_losses_have_the_lengths_of_the_closed_form(
     sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
     start = loss * (1 - loss)
     expected = sent * start + len(table) * loss**2
-    assert abs(bursts - expected) <= 4 * math.sqrt(sent * start * (1 - 3 * start)), (bursts, expected)
+    assert abs(bursts - expected) <= 5 * math.sqrt(sent * start * (1 - 3 * start)), (bursts, expected)
     longest = max(int(row["ip_loss_longest_burst"]) for row in table)
     assert (longest > 0) == (bursts > 0)
     if bursts:
         mean = (sent - total(table, "ip_packets_received")) / bursts
-        assert abs(mean - 1 / (1 - loss)) <= 4 * math.sqrt(loss / bursts) / (1 - loss), mean
+        assert abs(mean - 1 / (1 - loss)) <= 6 * math.sqrt(loss / bursts) / (1 - loss), mean
         # The probability that a run of k or more starts at one of `sent` positions is at most sent * (1 - loss) *
         # loss**k.
-        assert longest < math.log(1e4 * sent * (1 - loss), 1 / loss)
+        assert longest < math.log(1e6 * sent * (1 - loss), 1 / loss)
 
 
 def test_the_radio_neither_reorders_nor_duplicates_packets(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
@@ -82,7 +82,7 @@ def test_datagram_loss_is_the_loss_of_at_least_one_of_six_fragments(
     fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - repeats)
     delivered = (sent - repeats) * (1 - loss) ** FRAGMENTS + repeats * (1 - loss) ** (fragments_of_last / repeats)
     interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
-        confidence_level=FOUR_SIGMA, method="wilson"
+        confidence_level=FIVE_SIGMA, method="wilson"
     )
     assert interval.low <= 1 - delivered / sent <= interval.high, (sent, received)
     if percent >= 10:
@@ -126,6 +126,6 @@ def test_the_papers_loss_counts_first_fragments_only(
         assert float(row["paper_loss"]) == pytest.approx(1 - int(row["paper_received"]) / int(row["paper_packets"]))
     sent, received = total(table, "paper_packets"), total(table, "paper_received")
     interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
-        confidence_level=FOUR_SIGMA, method="wilson"
+        confidence_level=FIVE_SIGMA, method="wilson"
     )
     assert interval.low <= percent / 100 <= interval.high

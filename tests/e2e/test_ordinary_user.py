@@ -110,9 +110,9 @@ def test_a_complete_trial_of_an_ordinary_user(untouched: NamespaceComparison) ->
     assert completed.code == 0, completed.err
     output, _, content = completed.out.partition(BEFORE_THE_TABLE)
     assert "2 valid" in output
-    tcp, udp = csv.DictReader(content.strip().splitlines())
+    table = csv.DictReader(content.strip().splitlines())
+    tcp, udp = (row for row in table if row["status"] == "valid")  # on a busy machine, others may be void
     for row in (tcp, udp):
-        assert row["status"] == "valid"
         assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "fading may lose echoes"
     assert tcp["hash_match"] == "true"
     assert int(udp["datagrams_received"]) > 0

@@ -20,7 +20,7 @@ robots:
 roles:
   masterless:
     {sender: turtlebot-1, receiver: duckiedrone-1, rival: turtlebot-2, idle: turtlebot-3}
-emulated: {ros: builtin}
+emulated: {ros: builtin, late_bound: 2s}
 """
 
 RIVALS = """\
@@ -36,7 +36,7 @@ steps:
   - capture:
       robots: [receiver, rival]
       during:
-        - ping: {from: rival, to: receiver, count: 5, interval: 50ms}
+        - ping: {from: rival, to: receiver, count: 5, interval: 100ms}
 """
 
 

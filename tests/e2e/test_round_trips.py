@@ -9,6 +9,7 @@ import pytest
 from benchmarks.slow_links import slow_control
 from fieldkit.backends.registry import load_backend
 from fieldkit.config import schema
+from fieldkit.config.site import Site
 from fieldkit.core.events import Event, RepeatEnded
 from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.prompts import Unattended
@@ -18,6 +19,7 @@ from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import run_trial
 from tests.helpers import texts
+from tests.helpers.labs import site_with_late_packets
 
 pytestmark = pytest.mark.emulated
 
@@ -43,7 +45,8 @@ PROCEDURE: Final = texts.procedure(
 
 def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Path) -> None:
     procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
-    backend = load_backend("emulated", None, None)
+    document = schema.parse(site_with_late_packets(), source="fieldkit.yaml")
+    backend = load_backend("emulated", schema.validate(document, Site), document)
     cast = backend.cast(Topology.MASTERLESS)
     request = TrialRequest(procedure, parse_distance("5m"), topology=Topology.MASTERLESS)
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import locations
+from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import NamespaceComparison
-from tests.helpers.labs import built_in_ros, write_procedure
+from tests.helpers.labs import built_in_ros, site_with_late_packets, write_procedure
 from tests.helpers.runs import Run, only_trial, rows, run_here
 from tests.helpers.texts import procedure
 
@@ -109,6 +110,7 @@ def run_procedure(lab: Path, text: str) -> Run:
 def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
     tmp_path: Path, untouched: NamespaceComparison
 ) -> None:
+    (tmp_path / SITE_FILE).write_text(site_with_late_packets(), encoding="utf-8")
     run = run_here(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
@@ -131,6 +133,7 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
 
 
 def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_measurement(tmp_path: Path) -> None:
+    (tmp_path / SITE_FILE).write_text(site_with_late_packets(), encoding="utf-8")
     deadline = Deadline.after(LONG_S)
     run = run_procedure(tmp_path, PERMANENT)
     assert run.code == 0, run.err + run.out

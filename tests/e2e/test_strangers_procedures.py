@@ -33,8 +33,9 @@ robots:
   box-4: {profile: box}
 roles:
   masterless: {sender: box-1, receiver: box-2, talker: box-3, hearer: box-4}
+emulated: {late_bound: 2s}
 """
-TWO_ROBOTS = site({"box-1": "box", "box-2": "box"})
+TWO_ROBOTS = site({"box-1": "box", "box-2": "box"}, emulated="late_bound: 2s")
 
 PROCEDURES = {
     "asymmetric": """\

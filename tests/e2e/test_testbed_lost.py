@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, process_file, wait_for_end
 from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
 
@@ -21,15 +21,10 @@ def find_process(process_ids: set[int], module: str) -> int:
     """Return the process that runs a module; for a robot's processes, the first process of its namespace."""
 
     def runs_module(pid: int) -> bool:
-        try:
-            return module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-        except (FileNotFoundError, ProcessLookupError):  # it has exited after the processes were listed
-            return False
+        return module.encode() in process_file(pid, "cmdline")
 
     def is_first(pid: int) -> bool:
-        return "\t1\n" in re.sub(
-            "^(?!NSpid).*\n", "", Path(f"/proc/{pid}/status").read_text(encoding="utf-8"), flags=re.MULTILINE
-        )
+        return b"\t1\n" in re.sub(b"^(?!NSpid).*\n", b"", process_file(pid, "status"), flags=re.MULTILINE)
 
     module_pids = sorted(filter(runs_module, process_ids))
     return next(filter(is_first, module_pids), module_pids[0])

@@ -20,6 +20,7 @@ roles:
   masterless: {{sender: one, receiver: two}}
 emulated:
   ros: {ros}
+  late_bound: 2s
   radio: {{fading: false}}
   robots:
     one: {{{one}}}
@@ -33,7 +34,7 @@ MCAP: Final = (
 )
 # These parts of the procedure take time and do not depend on the variant.
 SHORTER: Final = (
-    *("count: 10", "count: 5", "interval: 200ms", "interval: 50ms"),
+    *("count: 10", "count: 5", "interval: 200ms", "interval: 100ms"),
     *("topology: master", "topology: masterless"),
 )
 

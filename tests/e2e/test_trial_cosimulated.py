@@ -18,7 +18,7 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.simulator_choice import resolve
 from tests.helpers.gazebo_server import gazebo_server, missing_libraries
-from tests.helpers.host import NamespaceComparison, descendants
+from tests.helpers.host import NamespaceComparison, descendants, process_file
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 from tests.helpers.sshd import wait_until
 
@@ -129,7 +129,7 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
         assert lateness is not None, ps_run.out
         assert "windows later than 0.001 ms, so a trial would be void" in ps_run.err
         lab_pid = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)["pid"]
-        (cosim_pid,) = (pid for pid in descendants(lab_pid) if COSIM in Path(f"/proc/{pid}/cmdline").read_bytes())
+        (cosim_pid,) = (pid for pid in descendants(lab_pid) if COSIM in process_file(pid, "cmdline"))
         os.kill(cosim_pid, signal.SIGKILL)
         wait_until(lambda: run_here(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
         failed_run = run_here(tmp_path, "lab", "ps")

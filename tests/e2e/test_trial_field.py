@@ -42,8 +42,9 @@ def test_robots_and_their_jobs_outlive_a_fieldkit_that_is_killed(tmp_path: Path)
 
 
 def wait_until_recording(field_robots: FieldRobots) -> tuple[str, ...]:
+    """Wait until the recorder is a running job; return the running jobs. The steps before it have jobs, too."""
     deadline = Deadline.after(60)
-    while not (running_jobs := running_jobs_of(field_robots, Role.SENDER)):
+    while "/record " not in " ".join(running_jobs := running_jobs_of(field_robots, Role.SENDER)):
         assert not deadline.expired, "the recording did not start"
     return running_jobs
 

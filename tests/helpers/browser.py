@@ -11,7 +11,8 @@ from playwright.sync_api import Browser, Page, Route, sync_playwright
 PHONE = 390
 LAPTOP = 1280
 """Widths of a page in pixels."""
-_TIMEOUT_MS = 120_000
+TIMEOUT_MS = 120_000
+"""Time limit of each wait on a busy machine."""
 
 
 @dataclass
@@ -28,7 +29,7 @@ def chromium() -> Iterator[Browser]:
     """Yield a headless Chromium of the Debian package."""
     with sync_playwright() as tools:
         browser = tools.chromium.launch(
-            executable_path="/usr/bin/chromium", args=["--no-sandbox"], timeout=_TIMEOUT_MS
+            executable_path="/usr/bin/chromium", args=["--no-sandbox"], timeout=TIMEOUT_MS
         )
         try:
             yield browser
@@ -42,7 +43,7 @@ def opened(
 ) -> Iterator[OpenedPage]:
     """Yield a page opened from a file; all other requests are rejected."""
     context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
-    context.set_default_timeout(_TIMEOUT_MS)
+    context.set_default_timeout(TIMEOUT_MS)
     opened_page = OpenedPage(context.new_page())
 
     def filter_request(route: Route) -> None:

@@ -11,13 +11,9 @@ from typing import Final
 
 import pytest
 
+from tests.helpers.sshd import free_port
+
 SCHEMES: Final = ("tcp", "udp", "dds", "ros1")
-
-
-def free_port() -> int:
-    """Return a port that no program uses."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def new_addresses(scheme: str) -> tuple[str, str]:

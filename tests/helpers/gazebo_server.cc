@@ -11,7 +11,8 @@
  *
  * With `--reset world`, a reset builds the world and its plugins again, as in later versions. A fault is an action of
  * another program at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first
- * model that moves), `exit`. `late-clock`: from this time on the clock of a step arrives 5 ms after its poses. */
+ * model that moves), `exit`. `late-clock`: from this time on the clock of a step arrives 5 ms after its poses.
+ * `lost-commands`: from this time on commands are lost, up to and including the message that follows them. */
 
 #include <ignition/msgs/boolean.pb.h>
 #include <ignition/msgs/clock.pb.h>
@@ -37,6 +38,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <condition_variable>
 #include <csignal>
@@ -265,7 +267,8 @@ private:
             trigger_publisher_ =
                 plugin_node_->Advertise<msgs::Empty>(plugin->GetElement("output")->Get<std::string>("topic"));
             std::function<void(const msgs::Empty &)> publish_trigger = [this](const msgs::Empty &message) {
-                trigger_publisher_.Publish(message);
+                if (!loses_commands_.exchange(false))
+                    trigger_publisher_.Publish(message);
             };
             plugin_node_->Subscribe(plugin->GetElement("input")->Get<std::string>("topic"), publish_trigger);
         });
@@ -298,8 +301,9 @@ private:
             } else {
                 return;
             }
-            std::function<void(const msgs::Twist &)> on_twist = [model_pointer](const msgs::Twist &twist) {
-                model_pointer->on_twist(twist);
+            std::function<void(const msgs::Twist &)> on_twist = [this, model_pointer](const msgs::Twist &twist) {
+                if (!loses_commands_)
+                    model_pointer->on_twist(twist);
             };
             plugin_node_->Subscribe("/model/" + model_sdf.Name() + "/cmd_vel", on_twist);
         });
@@ -368,6 +372,8 @@ private:
             _exit(1);
         else if (fault_ == "late-clock")
             is_clock_late_ = true;
+        else if (fault_ == "lost-commands")
+            loses_commands_ = true;
         fault_.clear();
     }
 
@@ -478,6 +484,7 @@ private:
     bool resets_world_;
     std::string fault_;
     bool is_clock_late_ = false;
+    std::atomic<bool> loses_commands_ = false;
     int64_t fault_ns_, step_ns_ = 0, period_ns_ = 0, time_ns_ = 0;
     int64_t pending_steps_ = 0;
     bool is_paused_ = true, resets_time_ = false;

@@ -77,7 +77,8 @@ def gazebo_server(folder: Path, sdf: str, *arguments: str) -> Iterator[GazeboSer
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
-            yield GazeboServer({"partition": partition, "ip": "127.0.0.1", "settle_s": 0.1}, process)
+            options = {"partition": partition, "ip": "127.0.0.1", "settle_s": 0.1, "timeout_s": 60}
+            yield GazeboServer(options, process)
         finally:
             os.kill(process.pid, signal.SIGCONT)
             process.terminate()

@@ -130,6 +130,14 @@ def owners(pids: set[int]) -> set[int]:
     return user_ids
 
 
+def process_file(pid: int, name: str) -> bytes:
+    """The content of a file of a process in /proc; empty if the process has exited."""
+    try:
+        return Path("/proc", str(pid), name).read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
 def is_running(pid: int) -> bool:
     """Return True if a process runs, which is the case until its last thread has exited."""
     process = Path("/proc", str(pid))

@@ -25,18 +25,26 @@ def replace_text(text: str, *changes: str) -> str:
     return text
 
 
-def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> Path:
-    """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
+def site_with_late_packets(*options: str) -> str:
+    """A site file with the default robots, in which a repeat is not void if a busy machine delivers packets late.
 
-    Tests that do not depend on ROS use it, because a short trial then takes two thirds of the CPU time. A repeat is
-    not void if a busy machine delivers packets late, so these tests must not compare delays. `radio` has the radio's
-    options.
+    Tests that use it must not compare delays.
+
+    Args:
+        options: Further options of emulated robots, in YAML: `ros: builtin`.
+    """
+    options_text = ", ".join(("late_bound: 2s", *options))
+    return f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{{options_text}}}\n"
+
+
+def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> Path:
+    """Write a `site_with_late_packets` with the built-in ROS instead of Debian's; return its path.
+
+    Tests that do not depend on ROS use it, because a short trial then takes two thirds of the CPU time. `radio` has
+    the radio's options.
     """
     site = folder / name
-    site.write_text(
-        f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin, late_bound: 2s, radio: {radio}}}\n",
-        encoding="utf-8",
-    )
+    site.write_text(site_with_late_packets("ros: builtin", f"radio: {radio}"), encoding="utf-8")
     return site
 
 

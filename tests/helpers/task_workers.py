@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.host import descendants
+from tests.helpers.host import descendants, process_file
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -38,14 +38,7 @@ traffic:
 
 def worker_processes(parent: int) -> list[int]:
     """Return the descendants of a process that run tasks of `multiprocessing`, including Dask workers."""
-    return [pid for pid in descendants(parent) if b"spawn_main" in _command_line(pid)]
-
-
-def _command_line(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
+    return [pid for pid in descendants(parent) if b"spawn_main" in process_file(pid, "cmdline")]
 
 
 def kill_random(pids: Sequence[int], generator: random.Random) -> bool:

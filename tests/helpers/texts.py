@@ -17,14 +17,16 @@ def site(robots: Mapping[str, str] = TURTLEBOTS, *, emulated: str = "", backend:
 
     Args:
         robots: Profile by name of the robot, in the order sender, receiver, relay.
-        emulated: Options of emulated robots, in YAML without the outer braces: `ros: builtin, record_air: true`.
+        emulated: Options of emulated robots, in YAML without the outer braces: `ros: builtin, record_air: true`. With
+            options, a repeat is not void if a busy machine delivers packets late, unless they have a `late_bound`.
         backend: Name of the backend.
     """
     entries = "".join(f"  {name}: {{profile: {profile}}}\n" for name, profile in robots.items())
     roles = ", ".join(f"{role}: {name}" for role, name in zip(("sender", "receiver", "relay"), robots, strict=False))
     topology = "master" if len(robots) > 2 else "masterless"
     text = f"backend: {backend}\nrobots:\n{entries}roles:\n  {topology}: {{{roles}}}\n"
-    return text + (f"emulated: {{{emulated}}}\n" if emulated else "")
+    bound = "" if "late_bound:" in emulated else ", late_bound: 2s"
+    return text + (f"emulated: {{{emulated}{bound}}}\n" if emulated else "")
 
 
 def procedure(

@@ -22,7 +22,8 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 ANNA = Holder("trial-a", "anna@one", "trial-a")
 DRIVE_SCRIPT = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
 LANDING_SCRIPT = (
-    "trap 'echo 1.0 land: x >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
+    "trap 'echo 1.0 land: x >&2; until [ -e ground ]; do sleep 0.05; done; echo 5.0 landed >&2; exit' INT; "
+    "echo up; while :; do sleep 0.05; done"
 )
 ALARM_SCRIPT = (
     "trap 'touch .jobs/fly/unhurried; echo 1.0 land: x >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "

@@ -213,9 +213,10 @@ def test_command_that_kills_its_shell_is_not_a_lost_link(debian_robot: Robot) ->
 @pytest.mark.emulated
 def test_endless_command_causes_a_timeout(debian_robot: Robot) -> None:
     pid = debian_robot.shell_pid()
-    argv = (*CALL, "left", "until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done")
+    argv = (*CALL, "left", "echo up; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done")
+    session = debian_robot.shell.begin(argv, deadline=soon(), until=b"up\n")
     with pytest.raises(LinkError, match="did not end in time"):
-        debian_robot.shell.run(argv, deadline=Deadline.after(0.5))
+        session.end(deadline=Deadline.after(0.5))
     assert debian_robot.shell_pid() != pid
     (debian_robot.home / "go").touch()
 

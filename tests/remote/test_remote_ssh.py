@@ -77,8 +77,9 @@ def test_wait_for_output_does_not_poll_because_of_standard_error(shell: SshShell
 
 
 def test_command_without_output_causes_a_timeout(shell: SshShell) -> None:
+    shell.run(("true",), deadline=soon())  # the next command waits for no connection
     with pytest.raises(LinkError, match="did not report in time"):
-        shell.begin(("sleep", "5"), deadline=Deadline.after(1.0), until=b"up\n")
+        shell.begin(("sleep", "20"), deadline=Deadline.after(2.0), until=b"up\n")
 
 
 @pytest.mark.parametrize("sessions", [1, 2])
@@ -123,9 +124,11 @@ def test_standard_input_may_exceed_all_windows(shell: SshShell) -> None:
 
 
 def test_endless_command_causes_a_timeout(shell: SshShell, tmp_path: Path) -> None:
+    script = 'echo up; while [ -e "$0" ]; do sleep 0.1; done'
+    session = shell.begin(("sh", "-c", script, str(tmp_path)), deadline=soon(), until=b"up\n")
     start_s = time.monotonic()
     with pytest.raises(LinkError, match="did not end in time"):
-        shell.run(("sh", "-c", 'while [ -e "$0" ]; do sleep 0.1; done', str(tmp_path)), deadline=Deadline.after(0.5))
+        session.end(deadline=Deadline.after(0.5))
     assert time.monotonic() - start_s < SOON
     tmp_path.rmdir()  # sshd does not terminate the command of a lost client
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"

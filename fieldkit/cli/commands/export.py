@@ -52,6 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
             _WRITERS[arguments.format](arguments, file)
             size_bytes = file.tell()
     except OSError as error:
+        if error.filename not in {None, str(out)}:
+            raise  # a trial cannot be read
         raise ConfigurationError(
             f"cannot be written: {error.strerror}", where=str(out), remedy="choose another -o"
         ) from error

@@ -40,7 +40,9 @@ def add(parser: Parser) -> None:
         "folder of this user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
-    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random draws (default 1)")
+    action.add_argument(
+        "--seed", type=shared.natural, default=1, metavar="N", help="seed of all random draws (default 1)"
+    )
     action.add_choice("--wifi", ("model", "linux"), help="Wi-Fi of the robots (default: the site file's, or model)")
     action.add_argument("--foreground", action="store_true", help="run in this terminal; Ctrl-C stops the robots")
     action.set_defaults(run=up)
@@ -130,6 +132,8 @@ def _add_move(actions: Commands) -> None:
     parser.set_defaults(run=move)
 
 
+_MAX_ROBOTS: Final = 10_000
+"""Largest number of equal robots; the limits of backends are smaller."""
 _EXAMPLE: Final = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP if it flies"
 _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
@@ -304,10 +308,12 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
     from fieldkit.lab import protocol
 
     site, document = sites.lab_site(arguments)
-    name = arguments.backend or sites.DEFAULT_BACKEND
+    name = sites.DEFAULT_BACKEND if arguments.backend is None else arguments.backend
     if arguments.robots is not None:
-        if arguments.robots < 1:
-            raise ConfigurationError("--robots: a lab has at least one robot", remedy="fieldkit lab up --robots 2")
+        if not 1 <= arguments.robots <= _MAX_ROBOTS:
+            raise ConfigurationError(
+                f"--robots: a lab has 1 to {_MAX_ROBOTS} robots", remedy="fieldkit lab up --robots 2"
+            )
         robots = {
             f"robot-{number}": SiteRobot(profile=arguments.profile) for number in range(1, arguments.robots + 1)
         }

@@ -103,13 +103,24 @@ def merge(base: PositionSources, override: PositionSources) -> PositionSources:
     return PositionSources(robots, {**base.clocks, **override.clocks}, base.heights or override.heights)
 
 
-def text(position_sources: PositionSources) -> str:
-    """Return the sources as JSON that `read` accepts."""
+def is_valid(position_source: PositionSource) -> bool:
+    """Return True if `read` accepts a source. It does not accept a number of 1e10 or more."""
+    try:
+        _record_from_json(PositionSource, json.loads(json.dumps(_changed_values(position_source))))
+    except JSON_ERRORS:
+        return False
+    return True
+
+
+def _changed_values(position_source: PositionSource) -> dict[str, Any]:
+    """Return the values that differ from the defaults."""
     defaults = asdict(PositionSource())
-    robots = {
-        role: {name: value for name, value in asdict(position_source).items() if value != defaults[name]}
-        for role, position_source in position_sources.robots.items()
-    }
+    return {name: value for name, value in asdict(position_source).items() if value != defaults[name]}
+
+
+def text(position_sources: PositionSources) -> str:
+    """Return the sources as JSON. `read` accepts it if each source is valid."""
+    robots = {role: _changed_values(position_source) for role, position_source in position_sources.robots.items()}
     clocks = {role: asdict(offset) for role, offset in position_sources.clocks.items()}
     return json.dumps({"robots": robots, "clocks": clocks, "heights": position_sources.heights}, indent=2) + "\n"
 

@@ -52,7 +52,9 @@ def add(parser: Parser) -> None:
         help="largest delay of 95 %% of the sent samples, for example 200ms (default: none)",
     )
     action.add_argument("--size", metavar="BYTES", help="only samples of this size: 100kB (default: all)")
-    action.add_argument("--repeats", type=int, default=5, metavar="N", help="valid repeats needed (default 5)")
+    action.add_argument(
+        "--repeats", type=shared.natural, default=5, metavar="N", help="valid repeats needed (default 5)"
+    )
     action.add_argument(
         "--share",
         metavar="SHARE",

@@ -57,8 +57,8 @@ def set_positions(
             positions. The heights of positions in metres are always used.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another process runs the trial, the trial has no such role, or a
-            file is missing or too large.
+        ConfigurationError: `folder` is not a trial, another process runs the trial, the trial has no such role, a
+            file is missing or too large, or a number is too large.
         EvidenceError: A file is not a valid GPX or CSV file, or the trial's evidence has changed.
     """
     plan = plans.read_plan(folder)
@@ -67,6 +67,12 @@ def set_positions(
         if isinstance(source, Path):
             _require_file(source)
             position_files.read_file(source)
+        times = PositionSource(offset_s=offset_s, gap_s=gap_s)
+        if not position_sources.is_valid(times if isinstance(source, Path) else source):
+            raise ConfigurationError(
+                f"the position of {role} has a number that is too large",
+                remedy="check the units of its place, of --offset and of --gap",
+            )
     # Position files that were added before are replaced, so their changes do not matter.
     changes = {
         name: change for name, change in verification.differences(folder).items() if not manifest.is_positions(name)

@@ -20,11 +20,17 @@ from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.studies.link_goodput import SIGNAL_STEP_DB, LoggedLink, predict_goodputs_bit_s
 
-_NUMBERS: Final = ("signal_dbm", "phy_rate_bit_s", "goodput_bit_s")
-_INTEGERS: Final = ("width_mhz", "streams", "guard_interval_ns", "mcs")
+_NUMBERS: Final = {"signal_dbm": (-200.0, 100.0), "phy_rate_bit_s": (0.0, 1e12), "goodput_bit_s": (0.0, 1e12)}
+"""Smallest and largest valid number of each column."""
+_INTEGERS: Final = {"width_mhz": (1, 1000), "streams": (1, 16), "guard_interval_ns": (1, 10_000), "mcs": (0, 100)}
+"""Smallest and largest valid integer of each column."""
 _TEXTS: Final = ("standard", "protocol")
+_SMALLEST_GOODPUT_BIT_S: Final = 1e-3
+"""Smaller goodputs are 0: they have no relative error."""
 _SHOWN_LINKS: Final = 30
 """Largest number of links that are printed one by one as a table."""
+_MAX_SHOWN: Final = 40
+"""Largest number of characters of a cell in a message."""
 _NO_SIGNAL: Final = "the log has no signal"
 
 
@@ -78,31 +84,57 @@ def run(arguments: argparse.Namespace) -> int:
 def read_log(path: Path) -> list[_Row]:
     """Return the rows of a CSV file with the columns of `LoggedLink` and, if measured, `goodput_bit_s`.
 
-    Other columns are ignored; an empty cell has the default of `LoggedLink`. Signals are rounded.
+    Other columns are ignored; an empty cell has the default of `LoggedLink`. Signals are rounded. The file can begin
+    with a byte order mark, and names of columns can be surrounded by spaces.
 
     Raises:
-        ConfigurationError: The file cannot be read, has no column `signal_dbm`, or contains an invalid number.
+        ConfigurationError: The file cannot be read, has no column `signal_dbm` or two of them, a row has more or
+            fewer cells than the header, or it contains an invalid number.
     """
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            if "signal_dbm" not in (reader.fieldnames or ()):
-                raise ConfigurationError(
-                    "there is no column signal_dbm",
-                    where=str(path),
-                    remedy=f"the columns are {', '.join((*_NUMBERS, *_INTEGERS, *_TEXTS))}; the first is required",
-                )
-            return [_read_row(cells, f"{path}:{reader.line_num}", reader.line_num) for cells in reader]
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.reader(file)
+            names = [name.strip() for name in next(reader, [])]
+            _check_names(names, path)
+            rows = []
+            for cells in reader:
+                where = f"{path}:{reader.line_num}"
+                if not cells:
+                    continue  # an empty line
+                if len(cells) != len(names):
+                    raise ConfigurationError(
+                        f"{len(cells)} cells in a table of {len(names)} columns",
+                        where=where,
+                        remedy="write points in numbers, not commas, and a cell for each column",
+                    )
+                rows.append(_read_row(dict(zip(names, cells, strict=True)), where, reader.line_num))
+            return rows
     except OSError as error:
         raise ConfigurationError(f"the log cannot be read: {error.strerror}", where=str(path)) from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigurationError("the log is not UTF-8", where=str(path), remedy="save it as UTF-8") from error
+    except csv.Error as error:
         raise ConfigurationError(f"the log is not a CSV file: {error}", where=str(path)) from error
 
 
-def _read_row(cells: Mapping[str, str | None], where: str, line: int) -> _Row:
+def _check_names(names: Sequence[str], path: Path) -> None:
+    """Raise ConfigurationError if the signal is missing, or a column that is used occurs twice."""
+    used_names = (*_NUMBERS, *_INTEGERS, *_TEXTS)
+    if repeated := next((name for name in used_names if names.count(name) > 1), None):
+        raise ConfigurationError(
+            f"two columns have the name {repeated}", where=str(path), remedy="remove or rename one of them"
+        )
+    if "signal_dbm" not in names:
+        remedy = f"the columns are {', '.join(used_names)}; the first is required"
+        if any(separator in name for name in names for separator in ";\t"):
+            remedy = "separate the cells by commas, and write points in numbers"
+        raise ConfigurationError("there is no column signal_dbm", where=str(path), remedy=remedy)
+
+
+def _read_row(cells: Mapping[str, str], where: str, line: int) -> _Row:
     values: dict[str, Any] = {}
     for name in (*_NUMBERS, *_INTEGERS, *_TEXTS):
-        text = (cells.get(name) or "").strip()
+        text = cells.get(name, "").strip()
         if text.lower() not in {"", "nan"}:
             values[name] = text if name in _TEXTS else _number(name, text, where)
     measured_bit_s = values.pop("goodput_bit_s", math.nan)
@@ -118,9 +150,14 @@ def _number(name: str, text: str, where: str) -> float | int:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or (name in _INTEGERS and not value.is_integer()):
+    low, high = (_NUMBERS | _INTEGERS)[name]
+    if not low <= value <= high or (name in _INTEGERS and not value.is_integer()):
         kind = "an integer" if name in _INTEGERS else "a number"
-        raise ConfigurationError(f"{name} is {text!r}", where=where, remedy=f"write {kind}, or leave the cell empty")
+        raise ConfigurationError(
+            f"{name} is {text[:_MAX_SHOWN]!r}",
+            where=where,
+            remedy=f"write {kind} from {low:g} to {high:g}, or leave the cell empty",
+        )
     return int(value) if name in _INTEGERS else value
 
 
@@ -181,7 +218,8 @@ def _links_sheet(rows: Sequence[_Row], goodputs_bit_s: Mapping[LoggedLink, float
         link, reason = row.link, _reason(row, goodputs_bit_s)
         predicted_bit_s = _predicted_bit_s(row, goodputs_bit_s)
         mode = None if link is None or reason is not None else link.mode()
-        error = predicted_bit_s / row.measured_bit_s - 1 if row.measured_bit_s > 0 else math.nan
+        has_error = row.measured_bit_s >= _SMALLEST_GOODPUT_BIT_S
+        error = predicted_bit_s / row.measured_bit_s - 1 if has_error else math.nan
         values.append(
             (
                 row.line,
@@ -235,9 +273,10 @@ def _errors(
     if not len(measured_bit_s):
         yield from (math.nan,) * 5
         return
-    yield float(measured_bit_s.mean())
+    mean_bit_s = float(measured_bit_s.mean())
+    yield mean_bit_s
     yield float(predicted_bit_s.mean())
-    yield float(predicted_bit_s.mean() / measured_bit_s.mean() - 1) if measured_bit_s.any() else math.nan
-    positive = measured_bit_s > 0
+    yield float(predicted_bit_s.mean()) / mean_bit_s - 1 if mean_bit_s >= _SMALLEST_GOODPUT_BIT_S else math.nan
+    positive = measured_bit_s >= _SMALLEST_GOODPUT_BIT_S
     errors = np.abs(predicted_bit_s[positive] / measured_bit_s[positive] - 1)
     yield from (float(np.quantile(errors, share)) if len(errors) else math.nan for share in (0.5, 0.9))

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.cli.display import show_note, showing_progress
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Sink
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
@@ -70,6 +71,14 @@ def run(arguments: argparse.Namespace) -> int:
     policies = [
         name for name in settings.read_policies(arguments) if not getattr(registry.policies()[name], "exact", False)
     ]
+    if not policies:
+        raise ConfigurationError(
+            "--orders: exact policies have no errors in a window", remedy="choose other policies with --policy"
+        )
+    if arguments.figure is not None and len(windows_s) < 2:
+        raise ConfigurationError(
+            "--figure: errors against the window need two windows", remedy="write for example --window 1ms,10ms"
+        )
     draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with showing_progress() as sink:
@@ -85,7 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
     if draw is not None:
         from sim_backends.cosim.commands import plot  # noqa: PLC0415 (importing matplotlib takes half a second)
 
-        draw(plot.error_against_window(by_policy))
+        figure = plot.error_against_window(by_policy)
+        if figure is None:
+            show_note("not drawn, because no policy has errors above 0 with two windows")
+        else:
+            draw(figure)
     return 0
 
 

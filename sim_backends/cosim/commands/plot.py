@@ -112,8 +112,11 @@ def growth_panel(rows: Iterable[Row], title: str) -> LogPanel | None:
     )
 
 
-def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Format], bytes]:
-    """Return a function that draws local errors against the window: a panel per error, a curve per policy."""
+def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Format], bytes] | None:
+    """Return a function that draws local errors against the window: a panel per error, a curve per policy.
+
+    The result is None if no policy has errors above 0 with at least two windows.
+    """
     panels = []
     for measure, (panel_title, label, factor) in _LOCAL_ERRORS.items():
         curves = []
@@ -123,6 +126,8 @@ def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Form
                 curves.append(Curve(name, windows_ms, values, f"{name}\norder {order_text(errors, measure)}"))
         if curves:
             panels.append(LogPanel(panel_title, "window (ms)", label, curves, labels_at_right=True))
+    if not panels:
+        return None
     return lambda form: plots.log_figure(panels, form)
 
 
@@ -178,10 +183,9 @@ def _points(path: Path) -> list[CostPoint]:
     """
     names = [field.name for field in fields(CostPoint)][1:]
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             points = [
-                CostPoint(row["policy"], *(float(row[name] or math.nan) for name in names))
-                for row in csv.DictReader(file)
+                CostPoint(row["policy"], *(_magnitude(row[name]) for name in names)) for row in csv.DictReader(file)
             ]
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise EvidenceError(
@@ -191,6 +195,23 @@ def _points(path: Path) -> list[CostPoint]:
     if not points:
         raise EvidenceError("no policy has numbers in this table", where=str(path), remedy=_REMEDY)
     return points
+
+
+_MAGNITUDES: Final = (1e-30, 1e30)
+"""Smallest and largest number that a table of a shootout can contain, except 0."""
+
+
+def _magnitude(text: str | None) -> float:
+    """Return an error or a cost in a table of a shootout; nan for an empty cell.
+
+    Raises:
+        ValueError: The text is not a number, or not an error or a cost.
+    """
+    value = float(text or math.nan)
+    low, high = _MAGNITUDES
+    if not (math.isnan(value) or value == 0 or low <= value <= high):
+        raise ValueError(f"{text!r} is neither an error nor a cost")
+    return value
 
 
 def _obstacles(recording: Recording) -> list[ObstacleOutline]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.cli.display import show_note
-from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Progress, Sink
@@ -19,7 +18,7 @@ from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.policies import registry
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.real_time import LATE_BOUND_S, Pace
-from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.loading import load_scenario, parse_value
 from sim_backends.cosim.scenario.phases import commensurate_events, incommensurate_window_s
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.seeds import workers_for
@@ -277,5 +276,4 @@ def _change(text: str) -> tuple[str, Any]:
             f"--set: {text!r} is not KEY=VALUE",
             remedy="write for example --set policy.window=5ms",
         )
-    # A value is parsed as YAML, as in the file: a number, a list, or a text.
-    return key, schema.parse(f"value: {value}", source="--set").data["value"]
+    return key, parse_value(value, "--set")

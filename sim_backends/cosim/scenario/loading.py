@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.config import catalog, schema
 from fieldkit.config.documentation import attribute_meanings, class_description, without_links
-from fieldkit.config.schema import Document, Strict
+from fieldkit.config.schema import Document, Location, Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.federate_choice import add_options, drop_options_of_replaced_federates
@@ -85,20 +85,38 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     return scenario
 
 
+def parse_value(text: str, option: str) -> Any:  # noqa: ANN401 (any YAML value)
+    """Return the value in an option, parsed as YAML, as in the file: a number, a list, or a text.
+
+    Raises:
+        ConfigurationError: The text is not a YAML value, or it continues with another key.
+    """
+    data = schema.parse(f"value: {text}", source=option).data
+    if len(data) > 1:
+        raise ConfigurationError(
+            f"{text!r} is more than one value", where=option, remedy="give each key with a separate option"
+        )
+    return data["value"]
+
+
 def _change(document: Document, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
     """Set the value of a key; missing parent mappings are created, and get the line number of their parent.
 
     Raises:
         ConfigurationError: A parent key has a value without keys, or an index is beyond the end of a list.
     """
-    location = tuple(int(key) if key.isdecimal() else key for key in keys)
-    *parents, last_key = location
+    location: Location = ()
     data = document.data
     try:
-        for key in parents:
-            data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
-        data[last_key] = value
-    except (IndexError, TypeError):
+        for number, key in enumerate(keys, start=1):
+            # Keys of mappings are texts, also if they consist of digits.
+            part = int(key) if isinstance(data, list) else key
+            location = (*location, part)
+            if number == len(keys):
+                data[part] = value
+            else:
+                data = data.setdefault(part, {}) if isinstance(data, dict) else data[part]
+    except (IndexError, TypeError, ValueError):
         raise ConfigurationError(
             f"the key {'.'.join(keys)} cannot be changed, because it does not exist",
             remedy="use the keys of the scenario's file, and numbers from 0 for the items of a list",

@@ -1,7 +1,7 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.antennas import AntennaOptions
@@ -110,6 +110,10 @@ class NetworkOptions(Strict):
     transports: Literal["federate", "builtin"] = "federate"
 
 
+TX_POWERS_DBM: Final = (-50, 50)
+"""Smallest and largest transmit power of an agent."""
+
+
 class AgentRadio(Strict):
     """The radio of an agent.
 
@@ -123,7 +127,7 @@ class AgentRadio(Strict):
     """
 
     standard: str = "802.11n"
-    tx_power_dbm: Annotated[Real, Field(ge=-50, le=50)] = 17
+    tx_power_dbm: Annotated[Real, Field(ge=TX_POWERS_DBM[0], le=TX_POWERS_DBM[1])] = 17
     sensitivity_dbm: Annotated[Real, Field(ge=-120, le=0)] = -82
     phy: WifiPhy | None = None
     antenna: AntennaOptions | None = None

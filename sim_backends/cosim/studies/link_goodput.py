@@ -19,7 +19,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.executors import Workers
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.schema import TX_POWERS_DBM, CosimScenario
 from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, run_many
 from sim_backends.radio.phy.high_throughput import mode_named
 from sim_backends.radio.phy.modes import BANDS, OFDM_MODES, Band, WifiMode
@@ -184,7 +184,13 @@ class LoggedLink:
         mode = self.mode()
         duration_s = _START_S + self._measured_s(rate_bit_s)
         loss_db = float(free_space_db(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), self.band.carrier_hz)[0])
-        radio: dict[str, Any] = {"standard": self.standard, "tx_power_dbm": self.signal_dbm + loss_db}
+        tx_power_dbm = self.signal_dbm + loss_db
+        if not TX_POWERS_DBM[0] <= tx_power_dbm <= TX_POWERS_DBM[1]:
+            low_dbm, high_dbm = (power_dbm - loss_db for power_dbm in TX_POWERS_DBM)
+            raise ConfigurationError(
+                f"signals below {low_dbm:.1f} dBm or above {high_dbm:.1f} dBm are not modelled at {self.band.name}"
+            )
+        radio: dict[str, Any] = {"standard": self.standard, "tx_power_dbm": tx_power_dbm}
         if amendment != "g":
             radio["standard"] = "802.11n 5 GHz" if amendment == "a" else self.standard
             radio["phy"] = {

@@ -21,7 +21,7 @@ from fieldkit.core.units import (
     parse_distance,
     parse_quantity,
 )
-from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.loading import load_scenario, parse_value
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 DISTANCE: Final = "distance"
@@ -41,7 +41,7 @@ _NOT_SETTINGS: Final = frozenset({"name", "summary", "seeds"})
 """Keys of a scenario that cannot be factors."""
 _BETWEEN_VALUES: Final = re.compile(r",(?![^\[{]*[\]}])")
 """A comma outside brackets."""
-_PLAIN_NUMBER: Final = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
+_PLAIN_NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 _QUANTITIES: Final = (
@@ -128,6 +128,10 @@ def parse_factors(words: Sequence[str]) -> tuple[Factor, ...]:
         factor = Factor(name, values)
         if factor.column in factors:
             raise ConfigurationError(f"--over: {name} is given twice", remedy="list all its values after one NAME=")
+        if (other := next((other for other in factors.values() if other.key == factor.key), None)) is not None:
+            raise ConfigurationError(
+                f"--over: {other.name} and {name} are the same setting", remedy="list all its values after one NAME="
+            )
         if len(set(values)) < len(values):
             raise ConfigurationError(f"--over: {name} has the same value twice", remedy="remove one of them")
         factors[factor.column] = factor
@@ -165,7 +169,7 @@ def load_combinations(
 
 def _parse_value(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
     """Return a value of `--over`, parsed like a value in the scenario's file."""
-    return schema.parse(f"value: {text}", source=f"--over {name}").data["value"]
+    return parse_value(text, f"--over {name}")
 
 
 def _require_setting(factor: Factor, scenario: CosimScenario) -> None:

@@ -162,10 +162,11 @@ class SweepFolder:
         try:
             yield
         except OSError as error:
+            remedy = "free some space" if files.is_disk_full(error) else "remove the cause, or choose another -o"
             raise ConfigurationError(
                 f"cannot be written: {error.strerror}",
                 where=str(error.filename or self.path),
-                remedy=f"all finished runs are saved; free some space, then continue: {self._continue_command}",
+                remedy=f"all finished runs are saved; {remedy}, then continue: {self._continue_command}",
             ) from error
 
     def _write(self, path: Path, content: Mapping[str, Any]) -> None:

@@ -79,9 +79,9 @@ def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[i
 REPLY_S: Final = 15.0
 """Minimum time that a request waits for its reply."""
 
-_EXIT_S: Final = 2.0
+_EXIT_S: Final = 5.0
 """Time for a process to exit at a request before it is killed."""
-_EXIT_STATUS_S: Final = 0.5
+_EXIT_STATUS_S: Final = 5.0
 """Maximum time after a process has closed its descriptors until its exit status is available."""
 _EXITED: Final = "it exited"
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"

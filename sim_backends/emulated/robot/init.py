@@ -332,7 +332,8 @@ def kill_processes(process: str) -> None:
             f"no process named {process} is running", remedy="on the robot: cat /proc/[0-9]*/comm | sort -u"
         )
     for pid in pids:
-        os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it has exited in the meantime
+            os.kill(pid, signal.SIGKILL)
 
 
 def discard_memory() -> None:

@@ -31,7 +31,7 @@ from sim_backends.emulated.autopilot.px4 import PX4
 from tests.agent.test_link_server import servers
 from tests.helpers import drones
 from tests.helpers.casts import DUCKIEDRONE
-from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.host import descendants, process_file, wait_for_end
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.nightly import mark_nightly
@@ -41,7 +41,7 @@ from tests.helpers.userlands import LocalShell
 pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "tcp-01-1")
-FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s, lease: 3s"
+FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s"
 DETECTION_LIMIT_S = 5.0
 """Maximum time until the loss is detected on a busy machine; a quiet machine needs less than 1 s."""
 NEAR_M = 0.6
@@ -72,7 +72,13 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def fly(
-    shell: Shell, url: int | str, wait_duration: str, on_wait: Callable[[], object], abort: OnAbort = OnAbort.LAND
+    shell: Shell,
+    url: int | str,
+    wait_duration: str,
+    on_wait: Callable[[], object],
+    abort: OnAbort = OnAbort.LAND,
+    *,
+    lease: str = "30s",
 ) -> None:
     """Fly a drone at a UDP port or a connection. `on_wait` is called when a nested step starts."""
     connection = url if isinstance(url, str) else f"udpout:127.0.0.1:{url}"
@@ -88,7 +94,8 @@ def fly(
     scene = Scene(
         Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, sections={ON_ABORT: AbortActions({Role.RECEIVER: abort})}
     )
-    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {wait_duration}}}}}, {{wait: {{duration: {wait_duration}}}}}]}}"
+    wait = f"{{wait: {{duration: {wait_duration}}}}}"
+    step = f"{{{FLIGHT}, lease: {lease}, during: [{wait}, {wait}]}}"
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
@@ -117,8 +124,7 @@ def test_takeover_by_a_person_aborts_the_nested_steps(shell: Shell) -> None:
 def agent_of(shell: Shell, job: str) -> int:
     """Return the process id of the agent of a job."""
     leader = int((shell.home / FOLDER / f".jobs/{job}/pid").read_text(encoding="ascii").split()[0])
-    names = {pid: Path(f"/proc/{pid}/comm").read_text(encoding="utf-8") for pid in descendants(leader)}
-    (pid,) = (pid for pid, name in names.items() if name.startswith("python"))
+    (pid,) = (pid for pid in descendants(leader) if process_file(pid, "comm").startswith(b"python"))
     return pid
 
 
@@ -298,7 +304,7 @@ def test_arducopter_returns_after_its_lease_has_expired(shell: Shell) -> None:
             shell.is_interrupted = True
 
         with pytest.raises(LinkError, match="out of range"):
-            fly(shell, port, "1ms", interrupt_link, OnAbort.RETURN)
+            fly(shell, port, "1ms", interrupt_link, OnAbort.RETURN, lease="3s")
         wait_until(lambda: not vehicle.is_armed, Deadline.after(60))
         assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "the drone is at the take-off point"
         shell.is_interrupted = False

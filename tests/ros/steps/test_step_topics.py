@@ -319,16 +319,18 @@ def test_samples_arrive_with_a_router_a_master_and_several_publishers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Several robots publish simultaneously to one robot; over Zenoh and ROS 1, each stream has a separate domain."""
-    zenoh = "        - topics: {name: z, from: sender, to: receiver, over: zenoh, discovery: router, duration: 1s}\n"
+    # A subscriber that pauses on a busy machine loses no samples.
+    common = "duration: 1s, patience: 60s, qos: {depth: 1000}"
+    zenoh = f"        - topics: {{name: z, from: sender, to: receiver, over: zenoh, discovery: router, {common}}}\n"
     stream_keys = [
         f"{{name: {over}{number}, from: {role}, to: receiver, over: {over}, domain: {number}, server: receiver, "
-        "rate: 20Hz, duration: 1s, patience: 60s}"
+        f"rate: 20Hz, {common}}}"
         for over in ("zenoh", "ros1")
         for number, role in enumerate(("sender", "relay"), start=1)
     ]
     text = "".join(f"        - topics: {keys}\n" for keys in stream_keys)
     extra_keys = f"{zenoh}  - together:\n      during:\n{text}"
-    ros1 = "over: ros1, rate: 50Hz, duration: 1s"
+    ros1 = f"over: ros1, rate: 50Hz, {common}"
     row_values = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", extra_keys=extra_keys))
     for name in ("", "z.", "zenoh1.", "zenoh2.", "ros11.", "ros12."):
         assert row_values[f"{name}topic_sent"] == row_values[f"{name}topic_received"] != "0"
@@ -345,7 +347,7 @@ def test_samples_arrive_between_robots_with_ros_2(tmp_path: Path, monkeypatch: p
     (tmp_path / "robots" / "real.yaml").write_text(
         profile.replace("name: turtlebot3_burger", "name: real").replace("  ping: ping", python), encoding="utf-8"
     )
-    keys = "from: sender, to: receiver, over: ros2, rate: 20Hz, duration: 1s, patience: 60s"
+    keys = "from: sender, to: receiver, over: ros2, rate: 20Hz, duration: 1s, patience: 60s, qos: {depth: 1000}"
     procedure = together(keys, f"{keys}, domain: 7, discovery: peers").replace("name: x", "name: lossy")
     site = SITE.replace("profile: turtlebot3_burger", "profile: real").replace("LOSS", "0%")
     folder = run_procedure(tmp_path, monkeypatch, procedure, site)

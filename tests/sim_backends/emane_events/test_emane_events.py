@@ -4,6 +4,7 @@ import json
 import math
 import struct
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -318,18 +319,20 @@ def publishing(*positions_m: tuple[float, float, float], losses: Sequence[Serial
 def test_agents_follow_events(network: None, tmp_path: Path) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(STANDING, encoding="utf-8")
-    options = {"device": "lo", "reference": list(TURIN), "wait": "200ms"}
+    options = {"device": "lo", "reference": list(TURIN)}
     scenario = load_scenario(path, {"physics.federate": "emane", "physics.options": options})
     with pytest.raises(
         UnansweredError, match=r"no location of one \(NEM 1\), two \(NEM 2\) has arrived on 224.1.2.8"
     ):
-        build(scenario)
+        build(load_scenario(path, {"physics.federate": "emane", "physics.options": options | {"wait": "200ms"}}))
     with publishing((12.0, 20.0, 0.5), (32.0, 20.0, 0.5)), build(scenario, policy="sliding_window") as simulation:
-        run = simulation.run()
+        start_s = time.monotonic()
+        simulation.run()
+        duration_s = time.monotonic() - start_s
         states = simulation.agents.states(scenario.duration_ns)
     assert states["one"].position_m == pytest.approx((12.0, 20.0, 0.5), abs=1e-6)
     assert states["one"].velocity_m_s == pytest.approx((2.0, 0.0, 0.0), abs=1e-9)
-    assert run.wall_s["wait"] > 0.3  # it runs in real time
+    assert duration_s > 0.3, "it runs in real time"
 
 
 def loss_event(messages: dict[str, Any], receiver_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:

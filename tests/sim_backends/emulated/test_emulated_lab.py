@@ -133,7 +133,7 @@ def test_a_lab_leaves_no_trace_on_the_host(untouched: NamespaceComparison) -> No
 
 
 def test_robots_reach_each_other_over_the_medium(emulation: EmulatedTestbed) -> None:
-    output = output_of(emulation.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
+    output = output_of(emulation.shells[Role.SENDER], "ping", "-c", "3", "-w", "30", "-i", "0.01", "turtlebot-2")
     assert "3 received" in output
     assert emulation.medium.stats().ports["turtlebot-1"].sent_packets >= 3
 

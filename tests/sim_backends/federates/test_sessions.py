@@ -36,6 +36,7 @@ from sim_backends.physics.body import Twist
 from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
 from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of, children, now_s
+from tests.helpers.sshd import free_port
 
 MS = 1_000_000
 REQUESTS = ("advance physics", "ping", "fork", "release", "advance physics", "bye")
@@ -253,11 +254,6 @@ def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path
             assert physics.advance(step * MS, {}).keys() == {"ann", "bob", "cy"}
         assert physics.session._child is not None
         assert "raw" in "".join(physics.session._child.last_output)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def start_server(address: str, **settings: object) -> threading.Thread:

@@ -293,3 +293,21 @@ def write_scenario(text: str, folder: Path) -> Path:
     path = folder / "meadow.yaml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("0", "unknown key 0"),
+        ("agents.0", "0"),
+        ("traffic.9", "traffic.9 cannot be changed"),
+        ("traffic." + "9" * 5000, "cannot be changed"),
+        ("traffic.x.rate", "traffic.x.rate cannot be changed"),
+        ("name.x", "name.x cannot be changed"),
+    ],
+)
+def test_a_key_that_does_not_exist_cannot_be_changed(tmp_path: Path, key: str, message: str) -> None:
+    path = tmp_path / "meadow.yaml"
+    path.write_text(SCENARIO.replace("robot: cart", "robot: turtlebot3_burger"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        load_scenario(path, {key: 1})

@@ -54,6 +54,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("window=1ms,1ms", "has the same value twice"),
         ("window=1ms,0.001s", "are the same setting: window=1ms; and window=0.001s"),
         ("window", "is not NAME=VALUE"),
+        ("window=1ms\nname: x", "is more than one value"),
         ("distance=20kg", "unit 'kg'"),
     ],
 )
@@ -309,3 +310,14 @@ def test_factors_with_units_are_numbers() -> None:
     assert rate.numbers == ("traffic_0_rate_hz", "Hz", (1000, 10))
     assert power.numbers == ("radio_tx_power_dbm", "dBm", (-3, 20))
     assert along.numbers is None, "the value of a column in metres is not negative"
+
+
+def test_a_setting_under_two_names_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="window and window are the same setting"):
+        parse_factors(["policy.window=1ms", "window=2ms"])
+
+
+@pytest.mark.parametrize("text", ["1.2.3", "224.1.2.8", "."])
+def test_a_text_of_digits_and_points_is_no_number(text: str) -> None:
+    (factor,) = parse_factors([f"network.options.version={text}"])
+    assert factor.numbers is None

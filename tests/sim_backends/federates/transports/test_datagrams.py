@@ -27,9 +27,9 @@ from sim_backends.federates.transports.datagrams import (
     unpack_datagram,
 )
 from sim_backends.federates.transports.udp_transport import UdpAddress
-from tests.helpers.federate_transports import free_port
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
+from tests.helpers.sshd import free_port
 
 Forward = Callable[[bytes, bool], list[bytes]]
 """Returns the datagrams that the network delivers for a datagram; the flag is True towards the listening side."""
