@@ -58,10 +58,11 @@ class FieldBackend:
         for name, robot in site.robots.items():
             for key in ("host", "user", "host_key"):
                 if getattr(robot, key) is None:
+                    remedy = f"fieldkit enroll {name}" if key == "host_key" else f"add {key}: to it"
+                    if site.emulated is not None and robot.host is None:
+                        remedy += "; or, for emulated robots, write backend: emulated"
                     raise ConfigurationError(
-                        f"robot {name!r} has no {key}",
-                        where=document.where(("robots", name)),
-                        remedy=f"fieldkit enroll {name}" if key == "host_key" else f"add {key}: to it",
+                        f"robot {name!r} has no {key}", where=document.where(("robots", name)), remedy=remedy
                     )
         self._site = site
         self._document = document

@@ -14,7 +14,7 @@ from fieldkit.cli.hints import add_options
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
 from fieldkit.core.text import print_text
-from fieldkit.core.units import format_count
+from fieldkit.core.units import format_count, plain_number
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
 
@@ -194,7 +194,7 @@ def _next_distance(distances: Sequence[str]) -> str:
         float(matches[0]["number"]) if len(matches) > 1 and matches[0]["unit"] == matches[1]["unit"] else 0.0
     )
     return (
-        f"{last_value + abs(last_value - previous_value):.9g}{matches[-1]['unit']}"
+        f"{plain_number(last_value + abs(last_value - previous_value), 9)}{matches[-1]['unit']}"
         if last_value != previous_value
         else ""
     )

@@ -6,7 +6,6 @@ of `Strict`, loaded by `load`.
 
 from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
-from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
@@ -131,8 +130,7 @@ def _converter(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator
 
 def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object, object]:
     def format_value(value: float) -> str:
-        # Quantities are read without exponents, but str() of a float has an exponent below 0.0001.
-        return f"{Decimal(f'{value / factor:.12g}'):f}{symbol}"
+        return f"{units.plain_number(value / factor)}{symbol}"
 
     serializer = PlainSerializer(format_value, return_type=str)
     return _converter(parse, symbol), serializer, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})

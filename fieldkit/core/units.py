@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from decimal import Decimal
 from fractions import Fraction
 from typing import Final
 
@@ -59,7 +60,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
 def _example(number: str, units: dict[str, float]) -> str:
     """Return the number with units, as a suggestion: `30m or 30ft`."""
     if next(iter(units)) == "%" and float(number) < 1:
-        return f"{100 * float(number):g}%"  # the number is probably a fraction
+        return f"{plain_number(100 * float(number), 6)}%"  # the number is probably a fraction
     return " or ".join(f"{number[:20]}{unit}" for unit in list(units)[:2])
 
 
@@ -79,6 +80,16 @@ def parse_offset_m(text: str) -> float:
     """Return a length in metres that may be negative, `-30ft`. Raises the same errors as `parse_quantity`."""
     length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
     return -length_m if text.startswith("-") else length_m
+
+
+def plain_number(value: float, digits: int = 12) -> str:
+    """Return a number without an exponent, as `parse_quantity` reads it: `0.0000002`, `1000000`.
+
+    Args:
+        value: The number.
+        digits: Number of significant digits.
+    """
+    return f"{Decimal(f'{value:.{digits}g}'):f}"
 
 
 def format_distance(distance: Distance) -> str:

@@ -44,6 +44,8 @@ def test_suggested_commands_are_valid(
         (["10m", "15m"], "20m"),
         (["2.5m"], "5m"),
         (["10m", "30ft"], "60ft"),
+        (["0.0000001mm"], "0.0000002mm"),
+        (["800000000mm"], "1600000000mm"),
         (["porch"], None),
         (["30ft", "30ft"], None),
     ],

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core import files
+from tests.helpers import texts
 from tests.helpers.runs import run_here
 from tests.helpers.tables import COMPARABLE, repeats, replace, write
 
@@ -14,8 +15,8 @@ from tests.helpers.tables import COMPARABLE, repeats, replace, write
     [
         (("lab", "plot", "--robots", "1_0"), "'1_0' is not a whole number"),
         (("lab", "plot", "--robots", "\N{ARABIC-INDIC DIGIT THREE}"), "is not a whole number"),
-        (("lab", "plot", "--robots", "1" + 9 * "0"), "--robots: a lab has 1 to 10000 robots"),
-        (("lab", "plot", "--robots", "0"), "--robots: a lab has 1 to 10000 robots"),
+        (("lab", "plot", "--robots", "1" + 9 * "0"), "--robots: a lab has at most 10000 robots"),
+        (("lab", "plot", "--robots", "0"), "--robots: a lab has at least one robot"),
         (("lab", "plot", "--backend", ""), "there is no backend ''"),
         (("trial", "los", "30ft", "--dry-run", "--backend", ""), "there is no backend ''"),
         (("trial", "los", "30ft", "--dry-run", "--junit", "."), "'.' is a folder, not a file"),
@@ -40,6 +41,13 @@ def test_options_may_be_between_words(tmp_path: Path) -> None:
     assert "unknown unit 'kg'" in run_here(tmp_path, "trial", "los", "30ft", "--dry-run", "40kg").err
     unknown = run_here(tmp_path, "aggregate", "a", "--by", "trial", "b", "--bye", "x")
     assert "no option or argument '--bye'" in unknown.err
+
+
+def test_a_file_of_emulated_robots_without_a_backend_has_both_remedies(tmp_path: Path) -> None:
+    site = texts.site(emulated="ros: builtin").replace("backend: emulated\n", "")
+    (tmp_path / "fieldkit.yaml").write_text(site, encoding="utf-8")
+    run = run_here(tmp_path, "trial", "los", "30ft", "--dry-run", "--topology", "masterless")
+    assert (run.code, "add host: to it; or, for emulated robots, write backend: emulated" in run.err) == (2, True)
 
 
 def test_a_tiny_width_has_a_finite_number_of_repeats(tmp_path: Path) -> None:

@@ -7,12 +7,15 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import (
+    FRACTION_PER_UNIT,
     format_bytes,
     format_distance,
     format_duration,
     parse_distance,
     parse_duration_s,
     parse_offset_m,
+    parse_quantity,
+    plain_number,
 )
 
 
@@ -96,3 +99,16 @@ def test_sizes_are_formatted_for_people(size_bytes: float, text: str) -> None:
 def test_a_length_may_be_in_millimetres() -> None:
     assert parse_distance("5mm").metres == pytest.approx(0.005)
     assert parse_offset_m("-30 mm") == pytest.approx(-0.03)
+
+
+@given(st.floats(1e-15, 9e14))
+def test_a_plain_number_is_a_number_of_a_quantity(value: float) -> None:
+    metres = parse_quantity(f"{plain_number(value)}m", {"m": 1.0}, "length") if value < 1e11 else value
+    assert metres == pytest.approx(value, rel=1e-11)
+    assert "e" not in plain_number(value, 3)
+
+
+def test_the_example_of_a_tiny_share_is_a_share() -> None:
+    with pytest.raises(ConfigurationError) as error:
+        parse_quantity("0.0000001", FRACTION_PER_UNIT, "share")
+    assert "write for example 0.00001%" in error.value.remedy

@@ -311,9 +311,8 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
     name = sites.DEFAULT_BACKEND if arguments.backend is None else arguments.backend
     if arguments.robots is not None:
         if not 1 <= arguments.robots <= _MAX_ROBOTS:
-            raise ConfigurationError(
-                f"--robots: a lab has 1 to {_MAX_ROBOTS} robots", remedy="fieldkit lab up --robots 2"
-            )
+            limit = "least one robot" if arguments.robots < 1 else f"most {_MAX_ROBOTS} robots"
+            raise ConfigurationError(f"--robots: a lab has at {limit}", remedy="fieldkit lab up --robots 2")
         robots = {
             f"robot-{number}": SiteRobot(profile=arguments.profile) for number in range(1, arguments.robots + 1)
         }

@@ -8,6 +8,7 @@ from typing import Final
 
 from fieldkit.core.columns import SCHEMA_VERSION, Value
 from fieldkit.core.model import Topology, Vector
+from fieldkit.core.units import plain_number
 from sim_backends.cosim.commands.results import FlowResult, SeedResult
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -55,7 +56,7 @@ def _identity(
         "topology": str(scenario.topology),
         "backend": BACKEND,
         "distance_m": distance_m,
-        "distance": f"{distance_m:g}m",
+        "distance": f"{plain_number(distance_m, 6)}m",
         "protocol": flow.protocol,
         "attempt": 1,
         "status": "failed" if result.stop_reason else "valid",

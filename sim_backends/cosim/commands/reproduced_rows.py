@@ -8,6 +8,7 @@ from typing import Final
 from fieldkit.core.columns import Value
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Distance, Protocol, RepeatId, Role, Status, Topology
+from fieldkit.core.units import plain_number
 from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, SimulatedRobot, SimulatedTrial
 from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
 from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
@@ -72,7 +73,7 @@ class ReproducedRows:
         peer = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
         points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], peer)]
         metres = round(math.dist(*points_m), 3)
-        return Distance(metres, f"{metres:g}m")
+        return Distance(metres, f"{plain_number(metres, 6)}m")
 
     def _check(self, trial: ReproducedTrial) -> None:
         """Check that the line of sight and the traffic of the scenario agree with the procedure.

@@ -13,7 +13,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Progress, Sink
 from fieldkit.core.executors import Workers
-from fieldkit.core.units import format_count, parse_duration_s
+from fieldkit.core.units import format_count, parse_duration_s, plain_number
 from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.policies import registry
 from sim_backends.cosim.policies.registry import make_policy
@@ -246,7 +246,7 @@ def note_commensurate_events(
             for item in commensurate
         )
         other_s = incommensurate_window_s(scenario, window_s)
-        instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
+        instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {plain_number(other_s * 1e3, 6)}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}: these events occur "
             "at few times within a window (phases), which the seed draws. Errors and added delays depend on these "
