@@ -19,9 +19,9 @@ from sim_backends.network.topics.qos import TopicFlow
 from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import Wire
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.core.random_streams import RandomStream
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
 COUNT: Final = 20

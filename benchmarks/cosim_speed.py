@@ -36,7 +36,7 @@ from sim_backends.network.packets import Packet, ReceivedDatagram
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
 

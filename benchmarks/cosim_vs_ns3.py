@@ -33,7 +33,7 @@ from sim_backends.network.tcp.connection import Tcp, TcpSample
 from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.udp import Udp
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.phy.modes import CHANNEL_6_HZ
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State

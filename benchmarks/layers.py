@@ -23,8 +23,8 @@ from benchmarks.swarm import swarm
 from fieldkit.core.model import DelayParts
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.antennas import antenna_of
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import RadioModel, WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World, load_world
 

@@ -25,10 +25,10 @@ import numpy as np
 from benchmarks import kernel_recordings
 from benchmarks.kernel_minstrel import MAX_TRIES, is_received, mode_name
 from sim_backends.emulated.linux_wifi.hwsim_messages import RateStage
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import PhyCapability, format_modes, mode_groups
 from sim_backends.radio.phy.modes import WifiMode, ack_ns
-from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
 
 TRACES: Final = {"walk": False, "walk with fading": True}

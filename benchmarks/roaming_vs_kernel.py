@@ -35,7 +35,7 @@ from benchmarks.roaming_recordings import (
     visits_s,
 )
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.phy.high_throughput import PhyCapability
 from sim_backends.radio.radio_options import RadioOptions
 

@@ -24,7 +24,7 @@ from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
-from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.models.fixed_links import UniformLinks
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
 

@@ -71,7 +71,8 @@ class CampaignFile(Strict):
         protocols: List of `tcp`, `udp`; if empty, the protocols of each procedure.
         repeats: Repeats per protocol; by default the repeats of each procedure.
         record: Duration of every recording; by default the duration in each procedure.
-        seed: Seed of the order and of all randomness in the trials, from 0.
+        seed: Seed of the order and of all randomness in the trials, from 0. Campaigns with the same seed draw the
+            same numbers.
         walk: Maximum distance over which the robots are carried in total, `300m`; without it, three times the
             shortest path.
         left_out: List of exclusions: trials that match every key of an entry are excluded.

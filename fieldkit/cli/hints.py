@@ -6,7 +6,7 @@ The code that creates a remedy has no access to the command line. This module ad
 import argparse
 import re
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Final
@@ -41,6 +41,10 @@ class CliOptions:
         if granted_names := permissions.granted(arguments):
             self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
+    def add(self, options: Iterable[tuple[str, str]]) -> None:
+        """Store options with their values, for example those of an earlier command."""
+        self._options += options
+
     def add_to_command(self, match: re.Match[str]) -> str:
         """Return the matched command with the stored options that it accepts and does not contain."""
         parser, words = self._parser, list[str]()
@@ -72,6 +76,12 @@ def adding_options(parser: Parser) -> Iterator[CliOptions]:
         yield options
     finally:
         _options.reset(token)
+
+
+def repeat_options(given: Iterable[tuple[str, str]]) -> None:
+    """Let `add_options` also add these options with their values, until the end of the command."""
+    if (options := _options.get()) is not None:
+        options.add(given)
 
 
 def add_options(text: str) -> str:

@@ -52,7 +52,8 @@ class WifiPhy(Strict):
             effort.
         amsdu_max_bytes: Maximum size of an A-MSDU (several packets in one frame of an aggregate): 3839, 7935 or 11454
             (only 802.11ac, and 802.11ax at 5 or 6 GHz). A-MSDUs are used between robots that both have this key, up
-            to the smaller of their sizes. Without this key each frame contains one packet.
+            to the smaller of their sizes. 7935 is 4065 in modes of 802.11n, whose aggregates have frames of at most
+            4095 bytes. Without this key each frame contains one packet.
         power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
             default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
         packet_time: Time that its bus (SDIO) and driver need for each packet that it sends, one after another, before

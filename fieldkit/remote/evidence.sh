@@ -2,7 +2,7 @@
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-print_state() { # print the state of the host and of interface $1
+print_state() { # print the state of the host, of interface $1 and of the radio with interface $radio
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
@@ -17,10 +17,10 @@ print_state() { # print the state of the host and of interface $1
         echo "==> ethtool -k <==" && ethtool -k "$interface"
     fi
     if command -v iw >/dev/null; then
-        echo "==> iw info <==" && timeout -s KILL "$SOURCE_S" iw dev "$interface" info
+        echo "==> iw info <==" && timeout -s KILL "$SOURCE_S" iw dev "$radio" info
         if [ "$?" != "$KILLED" ]; then # a driver that does not answer would delay the attempt
-            echo "==> iw station dump <==" && iw dev "$interface" station dump
-            echo "==> iw power save <==" && iw dev "$interface" get power_save
+            echo "==> iw station dump <==" && iw dev "$radio" station dump
+            echo "==> iw power save <==" && iw dev "$radio" get power_save
         fi
     fi
     echo "==> end <==" # missing if the disk is full
@@ -84,7 +84,7 @@ fail_to_write() { # fail with the reason why file $1 cannot be written
     fail "cannot write $1${reason:+: ${reason##*: }}"
 }
 
-write_snapshot() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
+write_snapshot() { # write file $1 with a snapshot of the sources of this robot with radio $2, unless it exists
     [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
 }
 
@@ -99,9 +99,10 @@ begin() {
         read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || fail_to_write .began
         sync_to_disk .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
+    find_radio "$interface"
     [ -e "$role-before.txt" ] || print_state "$interface" >"$role-before.txt" 2>&1 || fail_to_write "$role-before.txt"
-    write_snapshot "$role-sources-before.txt" "$interface"
-    start_sampler "$role" "$interface"
+    write_snapshot "$role-sources-before.txt" "$radio"
+    start_sampler "$role" "$radio"
     start_clock_sampler "$role"
     [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
@@ -112,9 +113,10 @@ pack() {
     enter "$dir"
     stop_samplers "$role"
     await_leaving_jobs
+    find_radio "$3"
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && print_job_ends && print_state "$3"; } >"$role-after.txt" 2>&1 ||
         fail_to_write "$role-after.txt"
-    write_snapshot "$role-sources-after.txt" "$3"
+    write_snapshot "$role-sources-after.txt" "$radio"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"

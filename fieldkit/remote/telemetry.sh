@@ -9,7 +9,18 @@ CHECK_INTERVAL=500 # interval of checks of the channel, the access point and the
 SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in units of 10 us
 BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes
 
-# Start a job that samples interface $2 of role $1. Do nothing without iw, or if it was started before.
+# Set radio to the Wi-Fi interface that carries the frames of interface $1: $1, or one below it (bat0 of batman-adv, a
+# bridge).
+find_radio() {
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+    radio=$1
+    # The lines are `4: wlan0: ...` or `5: wlan0.2@wlan0: ...`.
+    for lower in $(ip -o link show master "$1" 2>/dev/null | awk '{ sub(/[:@].*/, "", $2); print $2 }'); do
+        ! timeout -s KILL "$SOURCE_S" iw dev "$lower" info >/dev/null 2>&1 || radio=$lower
+    done
+}
+
+# Start a job that samples the radio with interface $2 of role $1. Do nothing without iw, or if it was started before.
 start_sampler() {
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     command -v iw >/dev/null && mkdir "$PWD/.jobs/link" 2>/dev/null || return 0

@@ -1,12 +1,12 @@
 """Times and flows in one attempt.
 
-The times are of packets, pings, jobs, faults and moves. Those of the first transfer's receiver are converted to the
-clock of its sender; other times are not converted. Flows are drawn as panels over time: the payload rate that iperf3
-measured, and the panels of steps that implement `DrawsPanels`.
+The times are of packets, pings, jobs, faults and moves. Times of robots are converted to the clock of the first
+transfer's sender, if the offset is known; times of moves are not converted. Flows are drawn as panels over time: the
+payload rate that iperf3 measured, and the panels of steps that implement `DrawsPanels`.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,8 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import host, iperf3, link, outage, ping, recordings, track
 from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.positions import position_columns
+from fieldkit.measure.robot_clock import Offset
+from fieldkit.measure.robot_state import exchanges
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
@@ -61,8 +63,8 @@ class Activity:
 class AttemptTimes:
     """Times from the evidence of one attempt.
 
-    Times of the second end are converted to the clock of the first end. Times of other robots are by their own
-    clocks, and times of moves by the clock of the testbed's track.
+    Times of robots are converted to the clock of the first end. Times of moves are by the clock of the testbed's
+    track.
 
     Attributes:
         bags: Contents of the bags that were sent, by file.
@@ -70,8 +72,9 @@ class AttemptTimes:
         pings: Step name, role and output of each ping with an output.
         clock_offset_ns: Offset that is subtracted from the times of each role. For the second end, it is the offset
             of its clock relative to the first end; 0 if it is unknown and no packet gives an estimate, see
-            `clock_note`. For all other roles it is 0.
-        clock_note: A sentence about the source of the clock offset.
+            `clock_note`. For the other robots, it is the difference of the measured offsets from the laptop's clock
+            (`exchanges`); 0 if it is unknown, or not larger than its error.
+        clock_note: Sentences about the source of the clock offsets.
         links: Samples of the radio link at each end.
         telemetry: Values from telemetry sources at each end by quantity (`telemetry_samples.series`).
         distances_m: Distances between the ends, with the start time of each; None in a gap of the positions; empty if
@@ -116,6 +119,12 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
     )
     clock_offset_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
+    for role, offset in _other_offsets(evidence, plan.cast, ends):
+        clock_offset_ns[role] = round(1e9 * offset.offset_s)
+        clock_note += (
+            f" Times of the {role} are corrected by {-1e3 * offset.offset_s:.3f} ms, with an error of up to "
+            f"{1e3 * offset.error_s:.3f} ms."
+        )
     links = {role: link.link_history(evidence.links(role)) for role in ends}
     times = AttemptTimes(
         bags={
@@ -190,6 +199,23 @@ def _clock_offset(
     if offset_ns is None:
         return 0, f"{unknown_text}: the times of each robot are from its own clock."
     return offset_ns, f"{unknown_text}: here the delay of the first packet is assumed to be 0."
+
+
+def _other_offsets(
+    evidence: AttemptEvidence, roles: Iterable[Role], ends: tuple[Role, Role]
+) -> Iterator[tuple[Role, Offset]]:
+    """Yield the role of each robot except the ends, and the offset of its clock relative to the first end.
+
+    The offset is the difference of two offsets from the laptop's clock. Robots are omitted if one of them is unknown,
+    or if the difference may be 0.
+    """
+    first = exchanges.laptop_offset(evidence, ends[0])
+    for role in roles:
+        other = None if role in ends else exchanges.laptop_offset(evidence, role)
+        if first is not None and other is not None:
+            offset = Offset(other.offset_s - first.offset_s, other.error_s + first.error_s)
+            if abs(offset.offset_s) > offset.error_s:
+                yield role, offset
 
 
 def _correct_clocks(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:

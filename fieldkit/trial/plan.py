@@ -52,6 +52,7 @@ class Plan(Strict):
         distance_m: Distance in metres.
         protocols: Protocols under test.
         repeats: Repeats per protocol.
+        record_s: Duration of every recording in seconds, if the operator gave one; the procedure contains it.
         cast: The robot in each role.
         procedure: The procedure.
         lab_bytes: Maximum number of bytes that the testbed itself adds to an attempt, such as data of an emulator.
@@ -78,6 +79,7 @@ class Plan(Strict):
     distance_m: Number
     protocols: tuple[Protocol, ...]
     repeats: Repeats
+    record_s: Number | None = Field(default=None, exclude_if=schema.is_empty)
     cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0
@@ -101,6 +103,17 @@ class Plan(Strict):
     def repeats_in_order(self) -> Iterator[RepeatId]:
         """Yield the planned repeats. Protocols alternate, so that slow changes of the channel affect both equally."""
         return (RepeatId(protocol, number + 1) for number in range(self.repeats) for protocol in self.protocols)
+
+    def overrides(self) -> Iterator[tuple[str, str]]:
+        """Yield the options of `fieldkit trial` that replaced settings of the procedure, each with its value."""
+        if self.topology is not self.procedure.topology:
+            yield "--topology", self.topology
+        if self.protocols != self.procedure.protocols:
+            yield from (("--protocol", protocol) for protocol in self.protocols)
+        if self.repeats != self.procedure.repeats:
+            yield "--repeats", str(self.repeats)
+        if self.record_s is not None:
+            yield "--record", f"{self.record_s:.9g}s"
 
     @property
     def placement(self) -> Placement:

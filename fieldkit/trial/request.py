@@ -111,6 +111,7 @@ def make_plan(
         distance_m=request.distance.metres,
         protocols=request.protocols or procedure.protocols,
         repeats=request.repeats or procedure.repeats,
+        record_s=request.record_s,
         cast={role: robot for role, robot in cast.items() if role in FIXED_ROLES or role in procedure.roles()},
         procedure=procedure,
         lab_bytes=lab_bytes,

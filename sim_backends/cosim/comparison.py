@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.run_record import Run
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from sim_backends.cosim.agents import AgentAbsence, SentDatagram
 from sim_backends.cosim.federates import FederateError, advance_text, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.world.dead_reckoning import DeadReckoned, extrapolate
 from sim_backends.world.motion import STILL, State
 

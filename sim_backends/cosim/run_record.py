@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Packet
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 

@@ -78,6 +78,7 @@ class StreamChannel:
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
         """Implement `FrameChannel.send`."""
+        self._require_open()
         unsent: bytes | memoryview = frame
         while True:
             try:
@@ -119,6 +120,11 @@ class StreamChannel:
             os.close(fd)
         self._fds = set()
 
+    def _require_open(self) -> None:
+        """Raise ClosedError if this channel is closed: its descriptors may now belong to another file."""
+        if not self._fds:
+            raise ClosedError("the connection was closed")
+
     def _read(self, deadline_s: float | None, bytes_before: int = 0) -> bytes:
         """Return the next bytes, at least one.
 
@@ -126,8 +132,7 @@ class StreamChannel:
             deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
             bytes_before: Number of bytes of the same frame that were already read, for the error message.
         """
-        if not self._fds:
-            raise ClosedError("the connection was closed")
+        self._require_open()
         while True:
             _wait(self._readable, deadline_s)
             try:

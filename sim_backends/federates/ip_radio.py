@@ -8,8 +8,7 @@ from sim_backends.federates.records import ArrivalDelay
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, broadcast_flow
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Packet
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     PACKET,
     PROPAGATION_NS,
     QUEUING_NS,
@@ -20,8 +19,9 @@ from sim_backends.radio.links import (
     LossLog,
     Pair,
 )
+from sim_backends.radio.core.random_streams import PacketIdentity
+from sim_backends.radio.mac.channel import Emitter
 from sim_backends.radio.mac.frames import TransmissionAttempt
-from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import Attitude, State
 
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.wire import IpPacket
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 
 HEADER_BYTES: Final = 20
 """Size of the header without options (RFC 791, 3.1)."""

@@ -6,7 +6,7 @@ Classes with an object per packet are tuples, which are faster to create than fr
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import CountsMisses, IpPacket, Transport, Wire
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.links import RADIO_OFF, Delay
-from sim_backends.radio.model import RadioModel
+from sim_backends.radio.core.links import RADIO_OFF, Delay
+from sim_backends.radio.mac.channel import Emitter
+from sim_backends.radio.models.radio_model import RadioModel
 from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import STILL, Attitude, State, attitude_of
 

@@ -1,5 +1,5 @@
-// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py
-// below ns-3's IP layer, with the same random draws for packets with an IdTag.
+// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of
+// sim_backends/radio/models/fixed_links.py below ns-3's IP layer, with the same random draws for packets with an IdTag.
 
 #ifndef FIELDKIT_FIXED_LINKS_H
 #define FIELDKIT_FIXED_LINKS_H

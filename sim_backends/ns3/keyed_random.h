@@ -1,4 +1,4 @@
-// The keyed random draws of sim_backends/radio/random_streams.py: Philox-4x64 with a key hashed from a name.
+// The keyed random draws of sim_backends/radio/core/random_streams.py: Philox-4x64 with a key hashed from a name.
 
 #ifndef FIELDKIT_KEYED_RANDOM_H
 #define FIELDKIT_KEYED_RANDOM_H

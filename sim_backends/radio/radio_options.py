@@ -16,13 +16,13 @@ from fieldkit.config.schema import (
 )
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.radio.infrastructure.infrastructure_options import (
+from sim_backends.radio.core.links import LinkParameters
+from sim_backends.radio.infrastructure_options import (
     AccessPointOptions,
     MicrowaveOvenOptions,
     NeighbourNetworkOptions,
     RoamingOptions,
 )
-from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.phy.high_throughput import mode_names
 from sim_backends.radio.phy.modes import G_MODES, N_MODES
 

@@ -1,9 +1,10 @@
 """802.11 stations on one channel: contention (DCF), hidden stations, ACKs, retries, relaying by an access point.
 
 The model is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
-`model.RadioModel`, in part in the subclass `WifiInWorld`. Frames between stations whose radios have the section `phy`
-(802.11n and later) are aggregated, and may use RTS/CTS and access categories. Power save delays frames to stations of
-an access point. Beacons have airtime only if the option `access_points` is used; fragmentation is not modelled.
+`radio_model.RadioModel`, in part in the subclass `WifiInWorld`. Frames between stations whose radios have the section
+`phy` (802.11n and later) are aggregated, and may use RTS/CTS and access categories. Power save delays frames to
+stations of an access point. Beacons have airtime only if the option `access_points` is used; fragmentation is not
+modelled.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -11,8 +12,7 @@ from itertools import permutations
 from typing import Generic
 
 from fieldkit.core.model import LinkSample
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     PACKET,
     PROCESSING_NS,
     QUEUE_FULL,
@@ -23,15 +23,16 @@ from sim_backends.radio.links import (
     Pair,
     Payload,
 )
+from sim_backends.radio.core.random_streams import PacketIdentity, RandomStream
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.driver_statistics import RadioMeter, link_samples
 from sim_backends.radio.mac.frame_exchange import FrameExchange
 from sim_backends.radio.mac.frames import Frame, TransmissionAttempt
 from sim_backends.radio.mac.packet_delivery import PacketDelivery
+from sim_backends.radio.mac.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
 from sim_backends.radio.mac.stations import Station
 from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT
 from sim_backends.radio.phy.transmissions import Emission
-from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
-from sim_backends.radio.random_streams import PacketIdentity, RandomStream
 
 
 class Wifi(Generic[Payload]):

@@ -13,19 +13,19 @@ from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from fieldkit.core.seeds import place_seed
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
-from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.mac.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
 from sim_backends.radio.mac.amsdu import limits_with_amsdu
+from sim_backends.radio.mac.channel import RadioChannel
+from sim_backends.radio.mean_loss import MeanLoss
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import common_modes, mode_groups
 from sim_backends.radio.phy.modes import OFDM_MODES
 from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.propagation.fading import Fading
 from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
-from sim_backends.radio.propagation.mean_loss import MeanLoss
 from sim_backends.radio.propagation.station_gains import StationGains
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.firmware_rate import FirmwareRate
 from sim_backends.radio.rate_control.minstrel import Minstrel
 from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli import main, results
+from fieldkit.cli import cli_options, main, results
+from fieldkit.core.model import Protocol, Topology
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.running import resumption
 from fieldkit.trial.running.runner import Outcome
 from tests.analysis.test_lines import PINGED, cells_of
+from tests.helpers.casts import los_plan
 from tests.helpers.tables import RepeatRow, replace
 
 
@@ -60,3 +64,26 @@ def test_suggested_distance_continues_the_series(
 def test_no_larger_distance_is_suggested_if_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
     without_reply = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
     assert commands(capsys, without_reply, all_quantities=True) == ["fieldkit report trials/0"]
+
+
+@pytest.mark.parametrize(
+    ("plan", "options"),
+    [
+        (los_plan(repeats=20), ""),
+        (
+            los_plan(repeats=3, protocols=(Protocol.UDP,), record_s=2.5),
+            "--protocol udp --repeats 3 --record 2.5s ",
+        ),
+        (los_plan(repeats=20).model_copy(update={"topology": Topology.MASTERLESS}), "--topology masterless "),
+    ],
+    ids=["defaults", "measurement", "topology"],
+)
+def test_after_resume_the_suggested_trial_has_the_options_of_the_resumed_trial(
+    plan: Plan, options: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcome = Outcome(Path("trials/1"), cells_of([PINGED]), 1, 0)
+    monkeypatch.setattr(resumption, "resumable", lambda _folder: plan)
+    monkeypatch.setattr(cli_options, "backend", lambda *_: ("field", None))
+    monkeypatch.setattr(resumption, "resume", lambda *_, **__: outcome)
+    assert main(["resume", "trials/1", "--yes"]) == 0
+    assert f"fieldkit trial {options}los 60ft" in capsys.readouterr().out

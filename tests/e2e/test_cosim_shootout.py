@@ -103,13 +103,14 @@ def test_orders_are_reported_for_any_transport(lab: Path) -> None:
 
 
 def test_the_bias_of_a_sampled_network_is_half_a_window_of_delay(lab: Path) -> None:
-    options = ("--bias", "--seeds", "3", "--policy", "scheduled", "--window", "20ms", "--figure", "b.svg")
+    options = ("--bias", "--seeds", "3", "--policy", "scheduled", "--window", "50ms,20ms", "--figure", "b.svg")
     run = cosim(lab, "shootout", "pass.yaml", *options, "--format", "csv")
     assert run.code == 0, run.err
     (delay,) = [row for row in rows(run.out) if row["measure"] == "delay_s"]
     # With a period of 20 ms each seed has one phase in the window: 0 to 20 ms, 10 on average.
     assert 0 < float(delay["bias"]) < 0.02
     assert float(delay["bias_low"]) < float(delay["bias"]) < float(delay["bias_high"])
+    assert "--bias uses only the shortest window of --window, 20 ms" in run.err
     assert "bias of delay (ms)" in (lab / "b.svg").read_text(encoding="utf-8")
 
 

@@ -29,8 +29,8 @@ TESTBED_FILES = ("track.csv", "link.csv", "lateness.txt", "*medium.txt")
 """Files that the emulator writes. No second source exists to verify them."""
 
 TOLERANCES: Mapping[str, float] = {
-    # One reply may be 20 ms late (measure.checks.ping_checks). One packet may be 0.1 s early (steps.kinds.capture),
-    # because no other source has the time at which a robot captured it.
+    # One packet may be 0.1 s early (steps.kinds.capture), because no other source has the time at which a robot
+    # captured it.
     "rtt_gap_s": 1.0,
     "rtt_*_s": 0.021,
     "paper_delay_s": 0.021,

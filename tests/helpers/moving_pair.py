@@ -10,7 +10,7 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import Run
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.world.motion import WayPoints
 
 SPEED_M_S = 1.7

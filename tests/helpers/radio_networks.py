@@ -9,8 +9,8 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.radio import UDP_ONLY, RadioNetwork, TransportFactory
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
 

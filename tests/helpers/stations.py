@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.phy.modes import WifiMode
 from sim_backends.radio.rate_control.rate_control import FixedRate, RateControl

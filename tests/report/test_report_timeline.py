@@ -11,8 +11,9 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import host, track
+from fieldkit.measure.robot_state import exchanges
 from fieldkit.report import timeline
-from fieldkit.report.charts import Panel
+from fieldkit.report.charts import Chart, Panel
 from fieldkit.report.contents import repeat_to_draw
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.ros.streams import topic_samples
@@ -46,13 +47,17 @@ def write_jobs(trial: Path, **spans: tuple[float, float]) -> Path:
     return folder
 
 
-def panels(trial: Path) -> list[Panel]:
+def time_line(trial: Path) -> Chart:
     evidence = load_evidence(sources.find([trial], print).read())
     row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
     assert row is not None
     chart, *_ = timeline.charts(row, evidence)
     assert chart.is_stacked
-    return list(chart.panels)
+    return chart
+
+
+def panels(trial: Path) -> list[Panel]:
+    return list(time_line(trial).panels)
 
 
 def bars(panel: Panel) -> dict[str, tuple[float, float]]:
@@ -134,6 +139,27 @@ def test_recordings_of_both_robots_are_drawn_on_the_clock_of_the_first(trial: Pa
     drawn_bars = bars(panels(trial)[0])
     ahead_s = drawn_bars["record scan"][0] - drawn_bars["record back"][0]
     assert ahead_s == pytest.approx(recorded.AHEAD_NS / 1e9, abs=0.02), "the clock of the receiver is ahead"
+
+
+@pytest.mark.parametrize(("ahead_ns", "is_corrected"), [(100 * 10**9, True), (5 * 10**6, False)])
+def test_jobs_of_a_third_robot_are_drawn_on_the_clock_of_the_first(
+    trial: Path, ahead_ns: int, is_corrected: bool
+) -> None:
+    folder = write_jobs(trial, capture=(1.0, 6.0))
+    after = (folder / host.after_file(Role.SENDER)).read_text(encoding="utf-8")
+    for role, offset_ns in ((Role.SENDER, 0), (Role.RELAY, ahead_ns)):
+        seconds, nanoseconds = divmod(STARTED_NS + offset_ns, recorded.SECOND_NS)
+        clock = f"{BOOT_S}.00 {seconds}.{nanoseconds:09d} {BOOT_S}.00"
+        (folder / host.before_file(role)).write_text(f"==> clock <==\n{clock}\n==> end <==\n", encoding="ascii")
+        jobs, _, _ = after.replace("capture", f"forward-{role}").partition("==> clock <==")
+        (folder / host.after_file(role)).write_text(f"{jobs}==> clock <==\n{clock}\n==> end <==\n", encoding="ascii")
+    request_and_response_ns = (STARTED_NS - 10**7, STARTED_NS + 10**7)
+    text = exchanges.text(dict.fromkeys((Role.SENDER, Role.RELAY), request_and_response_ns))
+    (folder / exchanges.FILE).write_text(text, encoding="ascii")
+    chart = time_line(trial)
+    drawn_bars = bars(chart.panels[0])
+    assert drawn_bars["forward-relay"] == pytest.approx(drawn_bars["forward-sender"], abs=0.05)
+    assert ("Times of the relay are corrected by -100000.000 ms" in chart.caption) == is_corrected
 
 
 def test_iperf3_has_a_panel_of_its_rate_per_second(trial: Path) -> None:

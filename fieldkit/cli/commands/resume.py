@@ -30,10 +30,11 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining repeats of the trial and print its table."""
-    from fieldkit.cli import cli_options, results
+    from fieldkit.cli import cli_options, hints, results
     from fieldkit.trial.running import resumption
 
-    resumption.resumable(arguments.trial)  # raise errors of the trial before errors of site files and backends
+    plan = resumption.resumable(arguments.trial)  # raise its errors before errors of site files and backends
+    hints.repeat_options(plan.overrides())
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         folder = arguments.trial.resolve().parent

@@ -26,7 +26,12 @@ def add(parser: Parser) -> None:
     shared.add_site(parser)
     shared.add_overrides(parser)
     parser.add_argument(
-        "--seed", type=shared.natural, metavar="N", default=1, help="seed of all random draws (default: 1)"
+        "--seed",
+        type=shared.natural,
+        metavar="N",
+        default=1,
+        help="seed of all random draws (default: 1); trials with the same seed draw the same numbers, so independent "
+        "trials need different seeds",
     )
     parser.add_argument(
         "--notes",

@@ -31,8 +31,10 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = settings.read_seeds(arguments, scenario)
     if len(seeds) < 2:
         raise ConfigurationError("--bias compares several seeds, but there is only one", remedy="add --seeds 20")
-    if arguments.windows:
-        scenario = settings.with_window(scenario, settings.read_windows_s(arguments, scenario)[0])
+    window_s, *unused_windows_s = settings.read_windows_s(arguments, scenario)
+    scenario = settings.with_window(scenario, window_s)
+    if unused_windows_s:
+        show_note(f"--bias uses only the shortest window of --window, {window_s * 1e3:g} ms")
     draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))

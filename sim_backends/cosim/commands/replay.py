@@ -11,6 +11,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.commands.results import seed_result
 from sim_backends.cosim.commands.run import show_results
 from sim_backends.cosim.recording.manifest import RunEnding
+from sim_backends.cosim.recording.recorder import PART_S
 from sim_backends.cosim.recording.replay import Recording, read_recording
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -21,9 +22,11 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title_of(recording), scenario, [result])
-    if recording.manifest.ending is not RunEnding.COMPLETE:
-        reason_text = f": {recording.manifest.why}" if recording.manifest.why else ""
-        show_note(f"the run did not complete ({recording.manifest.ending}){reason_text}")
+    ending, reason = recording.manifest.ending, recording.manifest.why
+    if ending in {RunEnding.KILLED, RunEnding.UNDER_WAY}:
+        reason = f"the recording lacks about the last {PART_S:g} s of wall time"
+    if ending is not RunEnding.COMPLETE:
+        show_note(f"the run did not complete ({ending}){f': {reason}' if reason else ''}")
     if arguments.mcap is not None:
         _write_mcap(arguments.mcap, recording)
     return 0

@@ -195,22 +195,26 @@ def _formation_sheet(results: Sequence[SeedResult]) -> Sheet:
 
 
 def _cost_text(results: Sequence[SeedResult]) -> str:
-    """Return the cost of the runs, and the hash over all their events, as text."""
+    """Return the cost of the runs, and the hash over all their events, as text.
+
+    A recording without an end has no hash. It has no window if its run was killed before the first part was written.
+    """
     simulated_s = sum(result.simulated_s for result in results)
     wall_s = sum(sum(result.wall_s.values()) for result in results)
     if not simulated_s or not wall_s:
-        return "no time was simulated"
+        return "no window was recorded"
     parts = {part: sum(result.wall_s[part] for result in results) for part in results[0].wall_s}
     split = ", ".join(f"{part} {100 * spent_s / wall_s:.0f} %" for part, spent_s in parts.items())
     exchanges = sum(result.windows for result in results) / simulated_s
     speed = f"{number_text(simulated_s / wall_s)} times as fast as real time"
     if any(result.lateness is not None for result in results):
         speed = f"paced by --realtime; without its waits, {speed}"
+    digests = [result.digest for result in results]
+    hash_line = f"\nevent hash: {_combined_digest(digests)}" if all(digests) else ""
     return (
         f"{number_text(simulated_s)} s simulated, {speed}\n"
         f"{number_text(exchanges)} exchanges per simulated second\n"
-        f"wall time: {split}\n"
-        f"event hash: {_combined_digest([result.digest for result in results])}"
+        f"wall time: {split}{hash_line}"
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from sim_backends.cosim.federates import Action
 from sim_backends.network.packets import Datagram, ReceivedDatagram
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.world.motion import State
 
 

@@ -83,6 +83,8 @@ class StateSamples:
             self._recorder.window(window)
 
 
+PART_S: Final = 2.0
+"""Default interval at which parts are written, in seconds of wall time."""
 _MAX_WINDOWS: Final = 50_000
 """Largest number of windows in a part, because a part is in memory until it is written."""
 _DISK_FULL_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT}
@@ -123,7 +125,7 @@ class RunRecorder:
         about: RunSettings,
         *,
         states_every_ns: int = SAMPLING_INTERVAL_NS,
-        part_every_s: float = 2.0,
+        part_every_s: float = PART_S,
         snap_bytes: int = 128,
         agents: Iterable[str] = (),
         flows: Mapping[str, CapturedFlow] = NO_FLOWS,

@@ -40,7 +40,7 @@ from sim_backends.physics.differential_drive import DifferentialDrive
 from sim_backends.physics.quadrotor import Quadrotor
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits, quadrotor
 from sim_backends.radio.antennas import Antenna, antenna_of
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.world.world import World
 
 

@@ -44,9 +44,9 @@ from sim_backends.network.topics.qos import Qos, TopicFlow
 from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.physics.bodies import Bodies
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import PathLosses, RadioModel, WifiInWorld
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import PathLosses, RadioModel, WifiInWorld
 from sim_backends.world.world import World, load_world
 
 _STARTS_WITHIN_NS: Final = 100_000_000

@@ -25,7 +25,7 @@ from sim_backends.network.bare_ip import BROADCAST, UNICAST
 from sim_backends.network.ip import Fragment
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
-from sim_backends.radio.model import RadioModel
+from sim_backends.radio.models.radio_model import RadioModel
 from sim_backends.world.world import World
 
 _BUILT_IN_SUMMARIES: Final = {

@@ -41,11 +41,11 @@ _MCS_PER_STREAM: Final = 8
 _START_S: Final = 0.5
 """Time that is not measured: TCP's slow start, and the first selections of a rate control."""
 _MEASURED_PACKETS: Final = 3000
-"""Approximate number of packets that the PHY rate could carry while the goodput is measured."""
+"""Approximate number of packets that the slower of radio and bus could carry while the goodput is measured."""
 _MEASURED_S: Final = (0.2, 2.0)
 """Shortest and longest time during which the goodput is measured."""
 _SELECTED_S: Final = 1.0
-"""This time if the link selects its modes: 20 updates of minstrel_ht."""
+"""Shortest time if the link selects its modes: 20 updates of minstrel_ht."""
 
 _QUEUE_S: Final = 1 / 128
 """Time to which Linux limits the data of a connection in the queue of a Wi-Fi radio: mac80211 sets sk_pacing_shift
@@ -170,10 +170,19 @@ class LoggedLink:
         Raises:
             ConfigurationError: The link is not modelled, or a change is invalid.
         """
+        rate_bit_s = self._fastest_bit_s()
+        scenario = self._scenario_at(rate_bit_s, changes)
+        if packet_s := _packet_s(scenario):
+            scenario = self._scenario_at(min(rate_bit_s, _PACKET_BITS / packet_s), changes)
+        if scenario.duration_ns <= _START_S * 1e9:
+            raise ConfigurationError(f"the first {_START_S:g} s of a run are not measured; set a longer duration")
+        return scenario
+
+    def _scenario_at(self, rate_bit_s: float, changes: Mapping[str, Any]) -> CosimScenario:
+        """Return the scenario with the traffic, queue and duration for the rate of its slower part, radio or bus."""
         amendment, _ = self._split_standard()
         mode = self.mode()
-        duration_s = _START_S + self.measured_s()
-        rate_bit_s = self._fastest_bit_s()
+        duration_s = _START_S + self._measured_s(rate_bit_s)
         loss_db = float(free_space_db(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), self.band.carrier_hz)[0])
         tx_power_dbm = self.signal_dbm + loss_db
         if not TX_POWERS_DBM[0] <= tx_power_dbm <= TX_POWERS_DBM[1]:
@@ -217,12 +226,17 @@ class LoggedLink:
             case _:
                 raise ConfigurationError(f"the protocol {self.protocol!r} is unknown", remedy="write tcp or udp")
 
-    def measured_s(self) -> float:
+    def _measured_s(self, rate_bit_s: float) -> float:
         """Return the time during which the goodput is measured."""
-        if (mode := self.mode()) is None:
-            return _SELECTED_S
         shortest_s, longest_s = _MEASURED_S
-        return min(max(_MEASURED_PACKETS * _PACKET_BITS / mode.rate_bit_s, shortest_s), longest_s)
+        measured_s = min(max(_MEASURED_PACKETS * _PACKET_BITS / rate_bit_s, shortest_s), longest_s)
+        return max(measured_s, _SELECTED_S) if self.mode() is None else measured_s
+
+
+def _packet_s(scenario: CosimScenario) -> float:
+    """Return the time that the sender's bus and driver need per packet."""
+    radio = scenario.agents["sender"].radio
+    return 0.0 if radio is None or radio.phy is None else float(radio.phy.packet_time)
 
 
 def predict_goodputs_bit_s(
@@ -244,11 +258,11 @@ def predict_goodputs_bit_s(
         FieldkitError: A run failed.
     """
     results: dict[LoggedLink, float | ConfigurationError] = {}
-    scenarios: dict[str, tuple[CosimScenario, float]] = {}
+    scenarios: dict[str, CosimScenario] = {}
     modelled: list[LoggedLink] = []
     for link in dict.fromkeys(links):
         try:
-            scenarios[str(len(modelled))] = link.scenario(changes), link.measured_s()
+            scenarios[str(len(modelled))] = link.scenario(changes)
             modelled.append(link)
         except ConfigurationError as error:
             results[link] = error
@@ -257,9 +271,9 @@ def predict_goodputs_bit_s(
     return results | dict(zip(modelled, goodputs, strict=True))
 
 
-def _goodput_bit_s(scenarios: Mapping[str, tuple[CosimScenario, float]], task: Task) -> float:
+def _goodput_bit_s(scenarios: Mapping[str, CosimScenario], task: Task) -> float:
     """Return the payload bits that arrive per second after the start."""
-    scenario, measured_s = scenarios[task.setup]
+    scenario = scenarios[task.setup]
     start_ns = round(_START_S * 1e9)
     run = build(scenario, policy=task.policy, seed=task.seed).run()
     arrived_bytes = sum(
@@ -267,4 +281,4 @@ def _goodput_bit_s(scenarios: Mapping[str, tuple[CosimScenario, float]], task: T
         for fate in run.fates.values()
         if fate.counted_ns is not None and fate.counted_ns > start_ns
     )
-    return arrived_bytes * 8 / measured_s
+    return arrived_bytes * 8e9 / (scenario.duration_ns - start_ns)

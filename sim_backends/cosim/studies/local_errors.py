@@ -22,7 +22,7 @@ from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")

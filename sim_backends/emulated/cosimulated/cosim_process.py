@@ -42,7 +42,7 @@ from sim_backends.emulated.medium.server import (
     MediumServer,
 )
 from sim_backends.emulated.process.worker import Message
-from sim_backends.radio.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, LinkCounters, Pair
+from sim_backends.radio.core.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, LinkCounters, Pair
 from sim_backends.world.motion import STILL, State
 
 _MAX_SLEEP_NS: Final = 10_000_000

@@ -30,9 +30,9 @@ from sim_backends.federates.remote import RemoteNetwork
 from sim_backends.network.bare_ip import BROADCAST, broadcast_flow
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Packet
-from sim_backends.radio.links import PACKET, PROCESSING_NS, PROPAGATION_NS, QUEUING_NS, TRANSMISSION_NS, Delay
+from sim_backends.radio.core.links import PACKET, PROCESSING_NS, PROPAGATION_NS, QUEUING_NS, TRANSMISSION_NS, Delay
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.mac.frames import TransmissionAttempt
-from sim_backends.radio.random_streams import PacketIdentity
 
 
 class CosimMedium(Devices, WindowObserver, Protocol):

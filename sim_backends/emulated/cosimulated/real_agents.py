@@ -9,7 +9,7 @@ from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, broadcast_flow
 from sim_backends.network.packets import Datagram, ReceivedDatagram
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 _KEPT_PACKETS: Final = 5000

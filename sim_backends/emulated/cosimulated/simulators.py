@@ -24,8 +24,8 @@ from sim_backends.physics.differential_drive import DifferentialDrive
 from sim_backends.physics.quadrotor import Quadrotor
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import RadioModel, WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
 from sim_backends.world.world import World

@@ -16,12 +16,12 @@ from fieldkit.core.model import Vector
 from sim_backends.emulated.linux_wifi.hwsim_messages import FLAG_NO_ACK, SentFrame
 from sim_backends.emulated.linux_wifi.rate_chain import RateChain, rate_chain
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.links import QUEUE_FULL, RADIO_OFF
+from sim_backends.radio.core.links import QUEUE_FULL, RADIO_OFF
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.mac.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.phy.modes import G_MODES, SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control.rate_control import RateControl
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel

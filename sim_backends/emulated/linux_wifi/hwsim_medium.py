@@ -20,7 +20,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
 )
 from sim_backends.emulated.linux_wifi.netlink import NLMSG_ERROR, NetlinkFormatError, NetlinkMessage
 from sim_backends.emulated.linux_wifi.rate_chain import legacy_index
-from sim_backends.radio.links import Pair
+from sim_backends.radio.core.links import Pair
 
 MAX_FREQUENCY_MHZ: Final = 7_125
 MIN_FREQUENCY_MHZ: Final = 2_412

@@ -5,7 +5,7 @@ from dataclasses import astuple, dataclass, field
 
 from fieldkit.core.model import DelayParts, LinkSample, StationSample
 from sim_backends.emulated.process.worker import Message
-from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.core.links import LinkCounters, Pair
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.core.model import DelayParts
 from sim_backends.emulated.medium.framing import Routes
 from sim_backends.emulated.medium.medium_stats import PortCounters
-from sim_backends.radio.links import PACKET, Delay, delay_parts
+from sim_backends.radio.core.links import PACKET, Delay, delay_parts
 
 # Byte 6 of the IPv4 header: the flag MF, and the upper bits of the fragment offset; byte 7 has the lower bits.
 _MORE_FRAGMENTS: Final = 0x20

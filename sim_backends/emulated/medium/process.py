@@ -26,9 +26,9 @@ from sim_backends.emulated.medium.server import (
     AttemptLog,
     MediumServer,
 )
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.links import PACKET, LinkCounters, Pair, processing_ns
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.core.links import PACKET, LinkCounters, Pair, processing_ns
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import RadioModel, WifiInWorld
 
 # Timeout of a poll. If the process sleeps longer, packets may have waited for the additional time.
 _MAX_SLEEP_NS: Final = 10_000_000

@@ -25,7 +25,7 @@ from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
 from sim_backends.radio.antennas import Antenna, decode_antenna
-from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.core.links import LinkCounters, Pair
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import Attitude

@@ -12,8 +12,8 @@ from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 from sim_backends.emulated.robot.tun_devices import open_tun
 
-PID_FILE: Final = Path(STATE, "babeld.pid")
-"""File that babeld writes when it starts, before it opens its socket and sends its first hello."""
+BABEL_PORT: Final = 6696
+"""UDP port of Babel (RFC 8966, section 5)."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
@@ -40,7 +40,7 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
         ip = IPv4Interface(shared_address).ip
         rules += [f"redistribute local ip {ip}/32 allow", f"install ip {SHARED_NETWORK} pref-src {ip}"]
     settings = _settings(interface, address, hello_s, *rules)
-    return (*_program(str(PID_FILE), _LONG_TERM_STATE), *settings, interface, *tunnels)
+    return (*_program(_LONG_TERM_STATE), *settings, interface, *tunnels)
 
 
 def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
@@ -49,11 +49,12 @@ def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[
     The node announces only its own address. The daemon writes no files. The arguments are those of `babeld_command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
-    return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
+    return (*_program(""), *_settings(interface, address, hello_s, *filters), interface)
 
 
-def _program(pid: str, long_term_state: str) -> tuple[str, ...]:
-    return (shutil.which("babeld") or "/usr/sbin/babeld", "-I", pid, "-S", long_term_state)
+def _program(long_term_state: str) -> tuple[str, ...]:
+    no_pid_file = ""  # babeld does not start again if the file of a killed process exists
+    return (shutil.which("babeld") or "/usr/sbin/babeld", "-I", no_pid_file, "-S", long_term_state)
 
 
 def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tuple[str, ...]:
@@ -194,6 +195,13 @@ def has_listener(port: int) -> bool:
     # The first 21 characters of a line are its number and the local address.
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
     return any(local in line[:21] and line.split()[3] == listening for line in lines)
+
+
+def has_udp6_socket(port: int) -> bool:
+    """Return True if an IPv6 UDP socket is bound to `port`, as the kernel's table shows."""
+    # The second word of a line is the local address.
+    lines = Path("/proc/net/udp6").read_text(encoding="ascii").splitlines()[1:]
+    return any(line.split()[1].endswith(f":{port:04X}") for line in lines)
 
 
 def prepare_mesh(interface: str) -> None:

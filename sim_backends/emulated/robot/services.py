@@ -174,7 +174,7 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
             yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.babeld_command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
-        yield _program("babeld", argv, {}, network.PID_FILE.exists)
+        yield _program("babeld", argv, {}, partial(network.has_udp6_socket, network.BABEL_PORT))
 
 
 def _motion_service(name: str, serve: Callable[..., None]) -> Service:

@@ -21,7 +21,7 @@ from sim_backends.network.topics.rtps import (
 )
 from sim_backends.network.topics.writer import TopicWriter
 from sim_backends.network.wire import IpPacket, Wire
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 
 TRANSPORT: Final = "topic"
 """Name of the transport, as in packets of programs."""

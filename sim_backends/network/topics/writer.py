@@ -13,7 +13,7 @@ from sim_backends.network.topics.history import WriterHistory
 from sim_backends.network.topics.qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
 from sim_backends.network.wire import Wire, WireTimer
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.core.random_streams import PacketIdentity
 
 Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]
 """Sends a message to the other end. The radio derives its random numbers for the message from the identity, which

@@ -7,18 +7,18 @@ from typing import Any, Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.infrastructure.infrastructure_options import AccessPointOptions, NeighbourNetworkOptions
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.radio.infrastructure.interference import MicrowaveOven, NeighbourTraffic
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
 from sim_backends.radio.infrastructure.roaming import MONITOR_NS, Roaming
+from sim_backends.radio.infrastructure_options import AccessPointOptions, NeighbourNetworkOptions
+from sim_backends.radio.mac.channel import Emitter
 from sim_backends.radio.mac.frame_exchange import FrameExchange
 from sim_backends.radio.mac.frames import TransmissionAttempt
+from sim_backends.radio.mac.power_save import BEACON_INTERVAL_NS
 from sim_backends.radio.phy.modes import BAND_2_4, ENERGY_DETECTION_DBM
 from sim_backends.radio.phy.transmissions import Emission
-from sim_backends.radio.power_save import BEACON_INTERVAL_NS
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import RandomStream
 from sim_backends.radio.world_channel import WorldChannel, milliwatt
 from sim_backends.world.obstacles import Place
 from sim_backends.world.world import World

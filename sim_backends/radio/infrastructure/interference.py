@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from sim_backends.radio.channel import Emitter
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
+from sim_backends.radio.mac.channel import Emitter
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.phy.modes import Band, basic_mode
-from sim_backends.radio.random_streams import RandomStream
 
 NEIGHBOUR: Final = "neighbour"
 

@@ -12,8 +12,8 @@ from typing import Final, Protocol
 
 from typing_extensions import override
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import NOT_ASSOCIATED, RADIO_OFF, Payload
+from sim_backends.radio.core.links import NOT_ASSOCIATED, RADIO_OFF, Payload
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.frames import HEADER_BYTES, Frame
 from sim_backends.radio.mac.packet_delivery import PacketDelivery

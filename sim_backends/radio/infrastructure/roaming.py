@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.infrastructure.background_scan import BackgroundScan, prefers_other
-from sim_backends.radio.infrastructure.infrastructure_options import RoamingOptions
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
+from sim_backends.radio.infrastructure_options import RoamingOptions
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.contention import EventQueue
+from sim_backends.radio.mac.power_save import BEACON_INTERVAL_NS
 from sim_backends.radio.phy.transmissions import decibel
-from sim_backends.radio.power_save import BEACON_INTERVAL_NS
 
 BEACON: Final = "beacon"
 _NULL: Final = "null"

@@ -1,12 +1,11 @@
 """ACK and Block Ack after a data frame or an aggregate, and their timeout (IEEE 802.11-2020, 10.3.2.11)."""
 
-from collections.abc import Callable, Sequence
-from typing import Final, Generic, Protocol
+from collections.abc import Sequence
+from typing import Final, Protocol
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.contention import EventQueue
-from sim_backends.radio.mac.driver_statistics import RadioMeter
-from sim_backends.radio.mac.frames import TransmissionAttempt, control_record
+from sim_backends.radio.mac.control_frames import ControlFrames
 from sim_backends.radio.mac.reception import Reception
 from sim_backends.radio.mac.stations import Peer, Station
 from sim_backends.radio.phy.modes import SLOT_NS, Band, control_mode, response_ns
@@ -23,7 +22,7 @@ class FinishAttempt(Protocol[Payload]):
         """End the attempt of a station at a frame for a peer."""
 
 
-class Acknowledgements(Generic[Payload]):
+class Acknowledgements(ControlFrames[Payload]):
     """The ACKs and Block Acks of stations that share one channel.
 
     Args:
@@ -33,10 +32,6 @@ class Acknowledgements(Generic[Payload]):
         events: Scheduled events.
         reception: The frames on the air.
         finish: Called when a response was received, or at its timeout.
-
-    Attributes:
-        log: Called with every ACK and Block Ack that ends; None without a log.
-        meter: Counters of the radio drivers; None without counters.
     """
 
     def __init__(
@@ -49,15 +44,9 @@ class Acknowledgements(Generic[Payload]):
         *,
         finish: FinishAttempt[Payload],
     ) -> None:
-        self._names = names
-        self._sifs_ns = band.sifs_ns
+        super().__init__(names, band, stations, events, reception)
         self._timeout_ns = band.sifs_ns + _TIMEOUT_AFTER_SIFS_NS
-        self._stations = stations
-        self._events = events
-        self._reception = reception
         self._finish = finish
-        self.log: Callable[[TransmissionAttempt], None] | None = None
-        self.meter: RadioMeter | None = None
 
     def start(
         self,
@@ -95,8 +84,7 @@ class Acknowledgements(Generic[Payload]):
         packet, number = transmission.packet, transmission.attempt
         ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), size_bytes, packet, number)
         self._reception.start_response(transmission, ack)
-        if self.meter is not None:
-            self.meter.on_start(ack, None)
+        self._count(ack)
         ack_exchange_id = 0
         if station.receiving is ack and station.exchange_id == exchange_id:
             ack_exchange_id = station.exchange_id = exchange_id + 2  # so that the timeout is ignored
@@ -107,8 +95,7 @@ class Acknowledgements(Generic[Payload]):
     ) -> None:
         is_decoded = station.receiving is ack and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
-        if self.log is not None:
-            self.log(control_record(self._names, ack, station.index, "ACK", is_decoded=is_decoded))
+        self._log(ack, station.index, "ACK", is_decoded=is_decoded)
         if exchange_id == station.exchange_id:
             self._finish(now_ns, station, peer, acknowledged=is_decoded)
 

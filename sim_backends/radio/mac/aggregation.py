@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Generic
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.frames import HEADER_BYTES, Frame
 from sim_backends.radio.phy.modes import ACK_BYTES, PhyFormat, WifiMode
 

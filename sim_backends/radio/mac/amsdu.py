@@ -12,7 +12,7 @@ from typing import Final
 
 from typing_extensions import override
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.aggregation import (
     AMPDU_LIMITS,
     DELIMITER_BYTES,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fieldkit.core.model import LinkSample, StationSample
-from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.mac.stations import Peer
 from sim_backends.radio.phy.transmissions import Transmission, decibel

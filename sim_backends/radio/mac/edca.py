@@ -14,7 +14,7 @@ from typing import Final, Generic
 from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.contention import ChannelAccess, Contention
 from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.phy.modes import CW_MAX, CW_MIN, SLOT_NS, Band

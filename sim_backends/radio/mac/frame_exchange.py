@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, Generic
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import RETRIES_EXHAUSTED, Payload
+from sim_backends.radio.core.links import RETRIES_EXHAUSTED, Payload
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.mac.acknowledgements import Acknowledgements
 from sim_backends.radio.mac.aggregation import (
     MAX_PPDU_NS,
@@ -14,6 +14,7 @@ from sim_backends.radio.mac.aggregation import (
     BlockAckSession,
     remove_frames,
 )
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.driver_statistics import RadioMeter
 from sim_backends.radio.mac.frames import HEADER_BYTES, Frame, TransmissionAttempt, attempt_record
@@ -23,7 +24,6 @@ from sim_backends.radio.mac.rts_cts import ProtectedFrame, RtsCts, rts_threshold
 from sim_backends.radio.mac.stations import Peer, Station
 from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT, WifiMode, ack_ns, basic_mode, response_ns
 from sim_backends.radio.phy.transmissions import Transmission
-from sim_backends.radio.random_streams import PacketDraws
 
 # Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
 _JAMMED_RETRY_NS: Final = 1_000_000

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Generic, Literal
 
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     PACKET,
     PROPAGATION_NS,
     QUEUING_NS,
@@ -12,9 +12,9 @@ from sim_backends.radio.links import (
     Delay,
     Payload,
 )
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.phy.transmissions import Transmission
-from sim_backends.radio.random_streams import PacketIdentity
 
 HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""

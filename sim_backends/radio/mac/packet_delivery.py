@@ -3,8 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Generic
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     NOT_DECODED,
     OUT_OF_RANGE,
     QUEUE_FULL,
@@ -16,11 +15,12 @@ from sim_backends.radio.links import (
 )
 from sim_backends.radio.mac.aggregation import BlockAckSession
 from sim_backends.radio.mac.amsdu import AmsduSession
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.edca import category_of
 from sim_backends.radio.mac.frames import Frame
+from sim_backends.radio.mac.power_save import PowerSave
 from sim_backends.radio.mac.stations import CategoryPeer, Peer, Station
-from sim_backends.radio.power_save import PowerSave
 
 
 class PacketDelivery(Generic[Payload]):

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from operator import ge, truediv
 from typing import Final, Generic
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.mac.aggregation import QOS_HEADER_BYTES, Aggregate
 from sim_backends.radio.mac.amsdu import frame_bytes, frames_of
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.contention import CCA_TIME_NS, EventQueue
 from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.mac.overhearing import (
@@ -27,7 +28,6 @@ from sim_backends.radio.phy.transmissions import (
     part_success_probability,
     success_probability,
 )
-from sim_backends.radio.random_streams import PacketDraws
 
 _DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
 """Smallest ratio of a preamble to noise and interference at which a station detects the preamble."""

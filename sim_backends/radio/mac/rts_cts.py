@@ -1,19 +1,16 @@
 """RTS and CTS before data frames (IEEE 802.11-2020, 10.3.2.4 to 10.3.2.9)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Generic
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import Payload
-from sim_backends.radio.mac.contention import EventQueue
-from sim_backends.radio.mac.driver_statistics import RadioMeter
-from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt, control_record
-from sim_backends.radio.mac.reception import Reception
+from sim_backends.radio.core.links import Payload
+from sim_backends.radio.core.random_streams import PacketIdentity
+from sim_backends.radio.mac.channel import RadioChannel
+from sim_backends.radio.mac.control_frames import ControlFrames
 from sim_backends.radio.mac.stations import Station
-from sim_backends.radio.phy.modes import SLOT_NS, Band, WifiMode, control_mode
+from sim_backends.radio.phy.modes import SLOT_NS, WifiMode, control_mode
 from sim_backends.radio.phy.transmissions import Transmission
-from sim_backends.radio.random_streams import PacketIdentity
 
 _NO_RTS_BYTES: Final = 1 << 62
 """Threshold of a station that never sends RTS."""
@@ -55,36 +52,8 @@ class ProtectedFrame(Generic[Payload]):
     fail: Callable[[int], None]
 
 
-class RtsCts(Generic[Payload]):
-    """Exchanges of RTS and CTS of stations that share one channel.
-
-    Args:
-        names: Names of the stations.
-        band: Their band.
-        stations: Stations by index.
-        events: Scheduled events.
-        reception: The frames on the air.
-
-    Attributes:
-        log: Called with every RTS and CTS that ends; None without a log.
-        meter: Counters of the radio drivers; None without counters.
-    """
-
-    def __init__(
-        self,
-        names: Sequence[str],
-        band: Band,
-        stations: Sequence[Station[Payload]],
-        events: EventQueue,
-        reception: Reception[Payload],
-    ) -> None:
-        self._names = names
-        self._sifs_ns = band.sifs_ns
-        self._stations = stations
-        self._events = events
-        self._reception = reception
-        self.log: Callable[[TransmissionAttempt], None] | None = None
-        self.meter: RadioMeter | None = None
+class RtsCts(ControlFrames[Payload]):
+    """Exchanges of RTS and CTS of stations that share one channel."""
 
     def start(self, now_ns: int, frame: ProtectedFrame[Payload]) -> None:
         """Send RTS, at the start of the station's exchange.
@@ -98,8 +67,7 @@ class RtsCts(Generic[Payload]):
         is_idle = self._stations[frame.receiver].contention.busy_until_ns <= now_ns
         rts = Transmission(frame.station.index, now_ns, end_ns, mode, RTS_BYTES, frame.packet, frame.attempt)
         self._reception.start(rts, end_ns)
-        if self.meter is not None:
-            self.meter.on_start(rts, None)
+        self._count(rts)
         self._events.schedule(end_ns, self._end_rts, frame, rts, is_idle, frame.station.exchange_id)
 
     def _end_rts(
@@ -126,8 +94,7 @@ class RtsCts(Generic[Payload]):
         end_ns = now_ns + mode.airtime_ns(CTS_BYTES)
         cts = Transmission(receiver.index, now_ns, end_ns, mode, CTS_BYTES, frame.packet, frame.attempt)
         self._reception.start(cts, end_ns)
-        if self.meter is not None:
-            self.meter.on_start(cts, None)
+        self._count(cts)
         cts_exchange_id = 0
         if station.receiving is cts and station.exchange_id == exchange_id:
             cts_exchange_id = station.exchange_id = exchange_id + 2  # so that the timeout is ignored
@@ -147,7 +114,3 @@ class RtsCts(Generic[Payload]):
             frame.send(now_ns)
         else:
             frame.fail(now_ns)
-
-    def _log(self, transmission: Transmission, receiver: int, kind: ControlFrame, *, is_decoded: bool) -> None:
-        if self.log is not None:
-            self.log(control_record(self._names, transmission, receiver, kind, is_decoded=is_decoded))

@@ -7,14 +7,14 @@ from typing import Generic
 from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
-from sim_backends.radio.links import LinkCounters, Payload
+from sim_backends.radio.core.links import LinkCounters, Payload
+from sim_backends.radio.core.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.mac.aggregation import Aggregate, BlockAckSession
 from sim_backends.radio.mac.contention import ChannelAccess, Contention
 from sim_backends.radio.mac.edca import AccessCategories
 from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT, Band, WifiMode
 from sim_backends.radio.phy.transmissions import Transmission
-from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control.rate_control import RateControl
 
 

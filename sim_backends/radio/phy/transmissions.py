@@ -6,9 +6,9 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from typing import Final
 
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.phy.error_rates import log_success
 from sim_backends.radio.phy.modes import ACK_BYTES, WifiMode
-from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
 """SNR below which a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.radio.random_streams import RandomStream, first_draws
+from sim_backends.radio.core.random_streams import RandomStream, first_draws
 from sim_backends.world.shapes import Floats
 
 _ECHOES: Final = 12

@@ -14,10 +14,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Final
 
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.modes import WifiMode
 from sim_backends.radio.phy.transmissions import decibel
-from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control.rate_control import RateControl
 
 # A mode is usable if at most this share of frames of this size is corrupted.

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Final
 
+from sim_backends.radio.core.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, ack_ns
 from sim_backends.radio.phy.transmissions import decibel
-from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control.rate_control import RateControl
 
 # Constants of `Minstrel`; its docstring describes them.

@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from itertools import cycle
 from typing import Final
 
+from sim_backends.radio.core.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.phy.modes import CW_MAX, CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode
-from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control.rate_control import RateControl
 
 _UPDATE_NS: Final = 50_000_000

@@ -2,8 +2,8 @@
 
 from typing import Protocol
 
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.phy.modes import WifiMode
-from sim_backends.radio.random_streams import PacketIdentity
 
 
 class RateControl(Protocol):

@@ -434,3 +434,19 @@ def test_a_full_channel_reaches_the_deadline_of_its_writer() -> None:
         peer.detach()
     with pytest.raises(ClosedError):
         channel.receive(time.monotonic() + 1)
+
+
+def test_a_closed_channel_does_not_write_to_a_file_with_the_same_descriptor(monkeypatch: pytest.MonkeyPatch) -> None:
+    peer, other = socket.socketpair()
+    with other:
+        channel = StreamChannel(other.detach(), peer.fileno())
+        channel.close()
+        peer.detach()
+        file, writer = socket.socketpair()
+        with file, writer:
+            monkeypatch.setattr(channel, "_write_fd", writer.fileno())  # as if the kernel had reused the descriptor
+            with pytest.raises(ClosedError):
+                channel.send(b"frame", time.monotonic() + 1)
+            file.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                file.recv(1)

@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss, active, changes_ns
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
-from sim_backends.radio.links import OUT_OF_RANGE, RADIO_OFF, RETRIES_EXHAUSTED
+from sim_backends.radio.core.links import OUT_OF_RANGE, RADIO_OFF, RETRIES_EXHAUSTED
 from sim_backends.radio.mac.frames import HEADER_BYTES
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.modes import CHANNEL_6_HZ, DIFS_NS, ENERGY_DETECTION_DBM, G_MODES, SLOT_NS

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sim_backends.network.ip import HEADER_BYTES, MTU_BYTES, REASSEMBLY_NS, TIMED_OUT, Reassembly, fragments
 from sim_backends.network.wire import IpPacket
-from sim_backends.radio.links import LOST, RADIO_OFF
+from sim_backends.radio.core.links import LOST, RADIO_OFF
 
 SIZES = st.integers(HEADER_BYTES, 65535)
 

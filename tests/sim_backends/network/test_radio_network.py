@@ -22,7 +22,7 @@ from sim_backends.network.radio import RadioNetwork
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket, Wire
 from sim_backends.physics.paths import Paths
-from sim_backends.radio.model import RadioModel
+from sim_backends.radio.models.radio_model import RadioModel
 from sim_backends.radio.phy.modes import G_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints

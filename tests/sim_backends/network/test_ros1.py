@@ -14,7 +14,7 @@ from sim_backends.network.ros1.ros1_transport import Ros1
 from sim_backends.network.ros1.streams import CallRetry
 from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import IpPacket
-from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.core.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire
 
 MS = 1_000_000

@@ -4,7 +4,7 @@ import pytest
 import scipy
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.radio.links import LOST, OUT_OF_RANGE, QUEUE_FULL
+from sim_backends.radio.core.links import LOST, OUT_OF_RANGE, QUEUE_FULL
 from tests.helpers.radio_networks import MS, carry, fixed, network, packets, standing, wifi
 
 STATES = standing({"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0)})

@@ -4,8 +4,8 @@ import pytest
 
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.radio.fixed_links import mesh
-from sim_backends.radio.links import LinkParameters
+from sim_backends.radio.core.links import LinkParameters
+from sim_backends.radio.models.fixed_links import mesh
 from sim_backends.radio.radio_options import RadioOptions
 
 

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     LOST,
     NOT_DECODED,
     OUT_OF_RANGE,
@@ -16,7 +15,8 @@ from sim_backends.radio.links import (
     RADIO_OFF,
     RETRIES_EXHAUSTED,
 )
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.models.fixed_links import UniformLinks
+from sim_backends.radio.models.radio_model import RadioModel, WifiInWorld
 from sim_backends.radio.phy.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi

@@ -6,8 +6,8 @@ import pytest
 
 from fieldkit.config.profiles import Radio
 from sim_backends.radio.antennas import Antenna, antenna_of
-from sim_backends.radio.links import QUEUE_FULL, delay_parts
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.core.links import QUEUE_FULL, delay_parts
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.phy.high_throughput import PhyCapability
 from sim_backends.radio.radio_options import RadioOptions
 

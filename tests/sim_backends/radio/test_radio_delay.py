@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.model import DelayParts
-from sim_backends.radio.fixed_links import FixedLinks
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     PACKET,
     PROCESSING_NS,
     PROPAGATION_NS,
@@ -19,6 +18,7 @@ from sim_backends.radio.links import (
     delay_parts,
     processing_ns,
 )
+from sim_backends.radio.models.fixed_links import FixedLinks
 from sim_backends.radio.phy.modes import G_MODES
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import FixedPowers

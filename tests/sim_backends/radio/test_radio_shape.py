@@ -13,7 +13,7 @@ from fieldkit.core.model import Placement, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement
 from sim_backends.radio.antennas import antenna_of
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST

@@ -8,7 +8,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     Delivery,
     delay_parts,
 )

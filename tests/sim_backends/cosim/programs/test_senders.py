@@ -21,7 +21,7 @@ from sim_backends.cosim.programs.senders import (
 from sim_backends.cosim.programs.wrappers import CombinedProgram, Outage
 from sim_backends.cosim.scenario.agent_plans import BagTraffic
 from sim_backends.network.packets import Datagram, ReceivedDatagram
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
 from sim_backends.world.motion import State
 
 ORIGIN = State((0.0, 0.0, 0.0))

@@ -32,7 +32,7 @@ from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket
 from sim_backends.physics.paths import Paths
-from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.models.fixed_links import UniformLinks
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
 from tests.helpers.passing_robots import MS, SETTINGS

@@ -97,3 +97,27 @@ def test_changes_of_the_scenario_apply() -> None:
     link = LoggedLink(-50, mcs=7, protocol="udp")
     noisy = predict_goodputs_bit_s([link], {"radio.noise_floor_dbm": -60}, workers=IN_PROCESS)
     assert noisy[link] == 0
+
+
+PACKET_TIME = "agents.sender.radio.phy.packet_time"
+
+
+@pytest.mark.parametrize(("changes", "packets"), [({}, 157), ({"radio.queue_packets": 70}, 70)])
+def test_the_queue_of_a_slow_bus_contains_packets_for_8_ms(changes: dict[str, int], packets: int) -> None:
+    """With a longer queue, TCP would recover from the losses of slow start during the measurement."""
+    link = LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400, mcs=9)
+    assert link.scenario({PACKET_TIME: "50us", **changes}).radio.queue_packets == packets
+
+
+@pytest.mark.parametrize("protocol", ["tcp", "udp"])
+def test_a_slow_bus_limits_the_goodput(protocol: str) -> None:
+    link = LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400, mcs=9, protocol=protocol)
+    goodput = predict_goodputs_bit_s([link], {PACKET_TIME: "500us"}, workers=IN_PROCESS)[link]
+    assert goodput == pytest.approx(8 * 1460 / 500e-6, rel=0.02)
+
+
+@pytest.mark.parametrize(("duration", "is_predicted"), [("0.5s", False), ("0.7s", True)])
+def test_a_given_duration_is_that_of_the_measurement(duration: str, is_predicted: bool) -> None:
+    link = LoggedLink(-50, mcs=7, protocol="udp")
+    goodput = predict_goodputs_bit_s([link], {"duration": duration}, workers=IN_PROCESS)[link]
+    assert isinstance(goodput, float) == is_predicted

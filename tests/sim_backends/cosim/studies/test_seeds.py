@@ -14,7 +14,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.executors import Workers
 from sim_backends.cosim.studies.seeds import Task, run_many
-from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.core.random_streams import RandomStream
 from tests.helpers.host import is_running
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until

@@ -12,7 +12,7 @@ from sim_backends.cosim.studies.local_errors import local_errors
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import WayPoints
 

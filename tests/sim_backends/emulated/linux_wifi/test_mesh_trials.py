@@ -102,6 +102,11 @@ def test_the_interface_under_test_is_that_of_the_protocol(trial: Trial) -> None:
     assert f": {interface}: <" in state.partition("==> ip -s link <==")[2]
 
 
+def test_the_columns_of_the_link_are_those_of_the_wifi_interface(trial: Trial) -> None:
+    """With batman-adv, it is below the interface under test."""
+    assert all(trial.row[f"{role}_signal_median_dbm"] for role in ("sender", "receiver"))
+
+
 def test_telemetry_of_batctl_has_the_neighbours_in_range(trial: Trial) -> None:
     if trial.protocol == "babel":
         assert "sender_neighbours_min" not in trial.row

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.emulated.medium.ports import FlowDelays
-from sim_backends.radio.links import PACKET, QUEUING_NS
+from sim_backends.radio.core.links import PACKET, QUEUING_NS
 from tests.helpers.captures import RECEIVER, SENDER, datagram, ipv4
 
 UDP, TCP = 17, 6

@@ -24,7 +24,7 @@ from sim_backends.network.topics.rtps import (
 )
 from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import IpPacket
-from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.core.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire, lose_packets
 
 BEST_EFFORT = Qos("best_effort")

@@ -15,7 +15,7 @@ from sim_backends.network.topics.flow import TopicSession
 from sim_backends.network.topics.qos import MS, SECOND, Qos, TopicFlow
 from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import IpPacket
-from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.core.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire
 
 DELAY_NS = MS // 10

@@ -4,8 +4,8 @@ import pytest
 
 from fieldkit.core.model import LinkSample
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.mac.channel import Emitter
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
 
 MS, S = 10**6, 10**9

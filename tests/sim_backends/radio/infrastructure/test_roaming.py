@@ -11,10 +11,10 @@ import pytest
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.core.links import NOT_ASSOCIATED
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame, ManagementHandler
 from sim_backends.radio.infrastructure.roaming import BEACON_LOSS_NS, MONITOR_NS
-from sim_backends.radio.links import NOT_ASSOCIATED
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.phy.high_throughput import PhyCapability
 from sim_backends.radio.phy.modes import BAND_2_4, CW_MIN, SLOT_NS, ack_ns, basic_mode
 from sim_backends.radio.radio_options import RadioOptions

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typing_extensions import override
 
-from sim_backends.radio.links import RETRIES_EXHAUSTED
+from sim_backends.radio.core.links import RETRIES_EXHAUSTED
+from sim_backends.radio.core.random_streams import PacketIdentity
 from sim_backends.radio.mac.aggregation import (
     AMPDU_LIMITS,
     QOS_HEADER_BYTES,
@@ -20,7 +21,6 @@ from sim_backends.radio.mac.contention import CCA_TIME_NS
 from sim_backends.radio.mac.frames import Frame, TransmissionAttempt
 from sim_backends.radio.phy.high_throughput import format_modes
 from sim_backends.radio.phy.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, response_ns
-from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control.rate_control import FixedRate
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import HEADERS_BYTES, FixedPowers, saturate

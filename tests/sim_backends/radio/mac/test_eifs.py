@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import pytest
 from typing_extensions import override
 
-from sim_backends.radio.links import Delivery
+from sim_backends.radio.core.links import Delivery
 from sim_backends.radio.mac.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.mac.overhearing import certain_ratios, decoding_probability
 from sim_backends.radio.phy.error_rates import packet_error

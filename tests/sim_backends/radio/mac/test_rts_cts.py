@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 from typing_extensions import override
 
-from sim_backends.radio.links import RETRIES_EXHAUSTED
+from sim_backends.radio.core.links import RETRIES_EXHAUSTED
 from sim_backends.radio.mac.aggregation import AMPDU_LIMITS, AmpduLimits
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.phy.high_throughput import format_modes

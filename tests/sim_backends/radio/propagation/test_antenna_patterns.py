@@ -20,7 +20,7 @@ from sim_backends.cosim.scenario.schema import AgentRadio
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.radio.antennas import Antenna, antenna_of, decode_antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.propagation.antenna_patterns import (
     NULL_DBI,
     AntennaPattern,

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.config.wifi_phy import WifiAmendment
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import PhyCapability, format_modes, mode_groups
 from sim_backends.radio.phy.modes import BandName, WifiMode
 from sim_backends.radio.phy.transmissions import decibel
-from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
 
 STEP_NS = 2_000_000

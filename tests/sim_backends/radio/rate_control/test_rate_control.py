@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.phy.high_throughput import format_modes
 from sim_backends.radio.phy.modes import G_MODES, WifiMode
-from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.minstrel import Minstrel
 
 STEP_NS = 1_000_000

@@ -8,10 +8,10 @@ from typing_extensions import override
 
 from fieldkit.config.profiles import Radio
 from sim_backends.radio.antennas import antenna_of
-from sim_backends.radio.links import RADIO_OFF, delay_parts
+from sim_backends.radio.core.links import RADIO_OFF, delay_parts
+from sim_backends.radio.core.random_streams import RandomStream
+from sim_backends.radio.mac.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD
 from sim_backends.radio.phy.modes import G_MODES
-from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD
-from sim_backends.radio.random_streams import RandomStream
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import FixedPowers
 

@@ -9,13 +9,13 @@ from typing_extensions import override
 
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
+from sim_backends.radio.core.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
+from sim_backends.radio.core.random_streams import PacketIdentity
+from sim_backends.radio.mac.channel import Emitter
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.mac.packet_delivery import PacketDelivery
 from sim_backends.radio.phy.transmissions import Emission
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import Attitude

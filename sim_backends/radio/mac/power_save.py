@@ -10,7 +10,7 @@ take no airtime here, every beacon is received, and a station wakes up in no tim
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, Generic
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.mac.stations import Station

@@ -9,8 +9,8 @@ import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.fixed_links import FixedLinks, _LinkPacket
-from sim_backends.radio.links import Delay, LinkCounters, LinkParameters
+from sim_backends.radio.core.links import Delay, LinkCounters, LinkParameters
+from sim_backends.radio.models.fixed_links import FixedLinks, _LinkPacket
 
 MS = 1_000_000
 

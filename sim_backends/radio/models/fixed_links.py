@@ -12,8 +12,7 @@ from typing import Generic
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import LinkSample, StationSample, Vector
-from sim_backends.radio.channel import Emitter
-from sim_backends.radio.links import (
+from sim_backends.radio.core.links import (
     LOST,
     OUT_OF_RANGE,
     PACKET,
@@ -31,9 +30,10 @@ from sim_backends.radio.links import (
     Payload,
     delay_parts,
 )
+from sim_backends.radio.core.random_streams import PacketDraws, PacketIdentity
+from sim_backends.radio.mac.channel import Emitter
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.world.motion import Attitude
 
 

@@ -8,7 +8,7 @@ from random import Random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.random_streams import RandomStream, first_draws
+from sim_backends.radio.core.random_streams import RandomStream, first_draws
 
 NUMBERS = st.lists(st.integers(0, 10_000), min_size=1, max_size=20)
 
@@ -66,7 +66,7 @@ def test_first_draws_equal_the_draws_of_the_streams(seed: int, names: list[tuple
 def test_the_first_draw_imports_no_module() -> None:
     """An import at the first draw would delay the first packet by 7 ms."""
     program = (
-        "import sys; from sim_backends.radio.random_streams import RandomStream; before = set(sys.modules); "
+        "import sys; from sim_backends.radio.core.random_streams import RandomStream; before = set(sys.modules); "
         "RandomStream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
     )
     process = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)
