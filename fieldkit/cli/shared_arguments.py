@@ -15,6 +15,9 @@ PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, o
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
+LAB_PROFILE: Final = "turtlebot3_burger"
+"""Profile of the robots that `--robots` adds."""
+
 _MAX_DIGITS: Final = 15
 """Maximum number of digits of a whole number. A float represents all numbers of this length exactly."""
 
@@ -99,10 +102,7 @@ def add_robots(parser: Parser) -> None:
     parser.add_argument(
         "--robots", type=natural, metavar="N", help="use robots robot-1 to robot-N instead of those in the site file"
     )
-    profile = "turtlebot3_burger"
-    parser.add_argument(
-        "--profile", metavar="NAME", default=profile, help=f"profile of the N robots (default {profile})"
-    )
+    parser.add_argument("--profile", metavar="NAME", help=f"profile of the N robots (default {LAB_PROFILE})")
 
 
 def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:

@@ -17,10 +17,12 @@ from tests.helpers.tables import COMPARABLE, repeats, replace, write
         (("lab", "plot", "--robots", "\N{ARABIC-INDIC DIGIT THREE}"), "is not a whole number"),
         (("lab", "plot", "--robots", "1" + 9 * "0"), "--robots: a lab has at most 10000 robots"),
         (("lab", "plot", "--robots", "0"), "--robots: a lab has at least one robot"),
+        (("lab", "plot", "--profile", "husky"), "--profile is the profile of the robots of --robots"),
         (("lab", "plot", "--backend", ""), "there is no backend ''"),
         (("trial", "los", "30ft", "--dry-run", "--backend", ""), "there is no backend ''"),
         (("trial", "los", "30ft", "--dry-run", "--junit", "."), "'.' is a folder, not a file"),
         (("lab", "up", "--seed", "-1"), "'-1' is not a whole number"),
+        (("cosim", "conform", "carts", "--windows", "0"), "must be at least 1"),
         (("middleware", "recommend", ".", "-o", "out", "--repeats", "1_0"), "'1_0' is not a whole number"),
         (("lab", "plot", "--robots", "1", "-o", "none/lab.svg"), "none/lab.svg: No such file or directory"),
     ],
@@ -48,6 +50,14 @@ def test_a_file_of_emulated_robots_without_a_backend_has_both_remedies(tmp_path:
     (tmp_path / "fieldkit.yaml").write_text(site, encoding="utf-8")
     run = run_here(tmp_path, "trial", "los", "30ft", "--dry-run", "--topology", "masterless")
     assert (run.code, "add host: to it; or, for emulated robots, write backend: emulated" in run.err) == (2, True)
+
+
+def test_a_path_that_cannot_contain_a_recording_has_the_error_of_the_path(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "broken" / "run.json").mkdir(parents=True)
+    for name, message in (("file", "there is no recording"), ("broken", "cannot be read: Is a directory")):
+        run = run_here(tmp_path, "cosim", "replay", name)
+        assert (run.code, message in run.err) == (4, True), run.err
 
 
 def test_a_tiny_width_has_a_finite_number_of_repeats(tmp_path: Path) -> None:

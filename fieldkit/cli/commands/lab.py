@@ -13,7 +13,7 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import print_table, show_error, show_note
 from fieldkit.cli.parser import Commands, Parser
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError, shell_command
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Vector
 from fieldkit.core.text import json_text, print_text
@@ -290,7 +290,7 @@ def _overview(arguments: argparse.Namespace) -> "Overview":
     """Return the lab that is up, or the lab that `up` would start if none is up or options choose its robots."""
     from fieldkit.lab import requests
 
-    if arguments.robots is None and arguments.site is None and arguments.backend is None:
+    if all(getattr(arguments, name) is None for name in ("robots", "profile", "site", "backend")):
         with suppress(requests.NoLabError):
             return requests.overview(_lab_folder())
     return _backend(arguments).overview()
@@ -309,13 +309,17 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
 
     site, document = sites.lab_site(arguments)
     name = sites.DEFAULT_BACKEND if arguments.backend is None else arguments.backend
+    if arguments.robots is None and arguments.profile is not None:
+        raise ConfigurationError(
+            "--profile is the profile of the robots of --robots, which is not given",
+            remedy=shell_command("fieldkit", "lab", "up", "--robots", 2, "--profile", arguments.profile),
+        )
     if arguments.robots is not None:
         if not 1 <= arguments.robots <= _MAX_ROBOTS:
             limit = "least one robot" if arguments.robots < 1 else f"most {_MAX_ROBOTS} robots"
             raise ConfigurationError(f"--robots: a lab has at {limit}", remedy="fieldkit lab up --robots 2")
-        robots = {
-            f"robot-{number}": SiteRobot(profile=arguments.profile) for number in range(1, arguments.robots + 1)
-        }
+        robot = SiteRobot(profile=shared.LAB_PROFILE if arguments.profile is None else arguments.profile)
+        robots = {f"robot-{number}": robot for number in range(1, arguments.robots + 1)}
         site = (
             Site(robots=robots, roles={}) if site is None else site.model_copy(update={"robots": robots, "roles": {}})
         )

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.cli.parser import Commands, Parser
-from fieldkit.cli.shared_arguments import add_jobs, add_json, add_workers, natural, repeats
+from fieldkit.cli.shared_arguments import add_jobs, add_json, add_workers, positive, repeats
 from sim_backends.cosim.commands.scenario_arguments import (
     RECORDING_HELP,
     add_changes,
@@ -285,7 +285,7 @@ def _add_conform(commands: Commands) -> None:
     add_changes(parser)
     parser.add_argument(
         "--windows",
-        type=natural,
+        type=positive,
         default=2000,
         metavar="N",
         help="number of windows in the check for drift (default 2000)",

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from fieldkit.config.json_records import Codec
 from fieldkit.core import files
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, shell_command
 
 SCHEMA_VERSION: Final = 2
 RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenario again with another --out"
@@ -151,13 +151,16 @@ def _read_file(folder: Path) -> RunManifest:
         content = json.loads(path.read_bytes())
         checksum = content.pop(_CHECKSUM, None) if isinstance(content, dict) else None
         manifest = _CODEC.parse(content)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise EvidenceError(
             "there is no recording of a co-simulation",
             where=str(folder),
             remedy="give the folder that contains run.json",
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
+    except OSError as error:
+        remedy = f"check its permissions: {shell_command('ls', '-l', path)}"
+        raise EvidenceError(f"cannot be read: {error.strerror}", where=str(path), remedy=remedy) from error
+    except (ValueError, RecursionError) as error:
         raise EvidenceError(f"this is not the record of a run: {error}", where=str(path), remedy=RUN_AGAIN) from error
     if manifest.schema_version != SCHEMA_VERSION:
         raise EvidenceError(

@@ -154,6 +154,11 @@ def load_combinations(
     scenario = load_scenario(name_or_path, changes)
     for factor in factors:
         _require_setting(factor, scenario)
+        if factor.key in changes:
+            raise ConfigurationError(
+                f"--over: another option sets {factor.key} to {changes[factor.key]}",
+                remedy=f"remove this option, or {factor.name} from --over",
+            )
     for values in product(*(factor.values for factor in factors)):
         values_by_name = dict(zip((factor.name for factor in factors), values, strict=True))
         all_changes = dict(changes) | {

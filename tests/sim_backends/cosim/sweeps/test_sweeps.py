@@ -321,3 +321,9 @@ def test_a_setting_under_two_names_is_refused() -> None:
 def test_a_text_of_digits_and_points_is_no_number(text: str) -> None:
     (factor,) = parse_factors([f"network.options.version={text}"])
     assert factor.numbers is None
+
+
+def test_a_factor_that_another_option_sets_is_refused(tmp_path: Path) -> None:
+    words = ("cosim", "sweep", "baylands", "--duration", "1s", "--over", "duration=1s,2s", "-o", "out")
+    result = run_here(tmp_path, *words)
+    assert (result.code, "--over: another option sets duration to 1s" in result.err) == (2, True), result.err
