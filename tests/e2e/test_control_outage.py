@@ -89,8 +89,9 @@ def control_packets_during_transfer(path: Path) -> list[str]:
     """Return the SSH packets of fieldkit or a robot over the radio during the transfer.
 
     Pure acknowledgements are omitted. The packets with which the kernels close a broken connection are also omitted:
-    TCP
-    retransmits unacknowledged data with exponential backoff, and receives a reset.
+    TCP retransmits unacknowledged data with exponential backoff, and receives a reset. So are copies of the answer of
+    sshd to the command that started the transfer: on a busy machine it is sent only after the first packets of the
+    transfer, and the outage can begin before it arrives.
     """
     packets = list(rdpcap(str(path)))
     times = [
@@ -101,6 +102,13 @@ def control_packets_during_transfer(path: Path) -> list[str]:
     control = [packet for packet in packets if TCP in packet and 22 in (packet[TCP].sport, packet[TCP].dport)]
     assert control
     assert times
+    requests = [packet for packet in control if packet[TCP].dport == 22 and len(packet[TCP].payload) > 0]
+    last_request_s = max(float(packet.time) for packet in requests if float(packet.time) < min(times))
+    answer = next(
+        packet[TCP]
+        for packet in control
+        if packet[TCP].sport == 22 and len(packet[TCP].payload) > 0 and float(packet.time) > last_request_s
+    )
     newest_port = [packet[TCP].sport for packet in control if packet[TCP].flags == "S"][-1]
     ends: dict[tuple[int, int], int] = {}
     control_packets = []
@@ -113,6 +121,7 @@ def control_packets_during_transfer(path: Path) -> list[str]:
             min(times) < float(packet.time) < max(times)
             and (len(tcp.payload) > 0 or tcp.flags != "A")
             and not is_kernel_cleanup
+            and (tcp.sport, tcp.dport, tcp.seq) != (answer.sport, answer.dport, answer.seq)
         ):
             control_packets.append(packet.summary())
     return control_packets

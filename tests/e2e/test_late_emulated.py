@@ -4,14 +4,20 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.config.locations import SITE_FILE
 from tests.helpers.known_radio import make_lab
+from tests.helpers.labs import replace_text
 from tests.helpers.runs import only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
 
 def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None:
-    lab = make_lab(tmp_path / "late", "{}, late_bound: 0.001ms")
+    lab = make_lab(tmp_path / "late", "{}")
+    site = lab / SITE_FILE
+    site.write_text(
+        replace_text(site.read_text(encoding="utf-8"), "late_bound: 2s", "late_bound: 0.001ms"), encoding="utf-8"
+    )
     procedure = lab / "procedures" / "quick.yaml"
     procedure.write_text(
         procedure.read_text(encoding="utf-8").replace("attempts: 3", "attempts: 1"), encoding="utf-8"
