@@ -42,7 +42,7 @@ def texts(node: ast.expr) -> list[str]:
         case ast.JoinedStr(parts):
             return ["".join(part.value if isinstance(part, ast.Constant) else "X" for part in parts)]  # type: ignore[misc]
         case ast.Call(func=ast.Name("shell_command"), args=words):
-            return [" ".join(word.value if isinstance(word, ast.Constant) else "X" for word in words)]  # type: ignore[misc]
+            return [" ".join(str(word.value) if isinstance(word, ast.Constant) else "X" for word in words)]
         case ast.IfExp(body=first, orelse=second) | ast.BinOp(left=first, right=second):
             return [*texts(first), *texts(second)]
     return []
